@@ -158,10 +158,14 @@ GROUPS = 20  # most groups of episodes whose means an evaluation keeps
 
 
 def group_means(values: Float[np.ndarray, "*lanes envs"]) -> Float[np.ndarray, "*lanes groups"]:
-    """Return means over up to `GROUPS` groups of environments, of equal size where at least ten groups can be."""
+    """Return means over up to `GROUPS` groups of environments, of equal size where at least ten groups can be.
+
+    Of unequal groups all means are moved alike, so that their mean is that of the values.
+    """
     count = values.shape[-1]
     number = next((n for n in range(GROUPS, 9, -1) if count % n == 0), min(GROUPS, count))
-    return np.stack([part.mean(-1) for part in np.array_split(values, number, axis=-1)], -1)
+    groups = np.stack([part.mean(-1) for part in np.array_split(values, number, axis=-1)], -1)
+    return groups + (values.mean(-1) - groups.mean(-1))[..., None] if count % number else groups
 
 
 MOST_STRETCHES = 25  # most stretches of a roll-out with progress

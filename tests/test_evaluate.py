@@ -40,7 +40,9 @@ def rolled(num_envs, steps, env=ENV):
 
 @pytest.mark.parametrize(("count", "groups"), [(100, 20), (32, 16), (10, 10), (7, 7), (23, 20)])
 def test_episodes_are_kept_as_means_of_groups(count, groups):
-    assert evaluate.group_means(np.arange(float(count))[None]).shape == (1, groups)
+    means = evaluate.group_means(np.arange(float(count))[None])
+    assert means.shape == (1, groups)
+    assert means.mean() == pytest.approx((count - 1) / 2)
 
 
 def test_means_over_first_episodes_are_of_all_of_them_or_of_none():

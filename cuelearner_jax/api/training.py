@@ -84,7 +84,7 @@ def train(
         guidance: kinds of guidance (default: the preset's, or all, as far as the world can have them).
         labels: label budgets, or a label file in place of the teacher, with as many as its shortest seed has (default:
             the preset's budgets; with a configuration, 100).
-        seeds: their number (0, 1, ...), or the seeds (default: the preset's; with a configuration, 8).
+        seeds: their number, from the preset's first on, or the seeds (default: the preset's; with a configuration, 8).
         split: episodes of the evaluations: "validation", or "tuning" for choosing settings.
         progress: show progress bars on standard error.
     """
@@ -104,7 +104,7 @@ def train(
     if isinstance(labels, str | os.PathLike):
         labels = (label_files.read(Path(labels)).budget,)
     seeds = usual.seeds if seeds is None else seeds
-    own = seeds_of(0, int(seeds)) if isinstance(seeds, int | np.integer) else tuple(map(index, seeds))
+    own = seeds_of(usual.seeds[0], int(seeds)) if isinstance(seeds, int | np.integer) else tuple(map(index, seeds))
     labels = (labels,) if isinstance(labels, int | np.integer) else labels
     own_kinds = (guidance,) if isinstance(guidance, str) else tuple(guidance)
     kinds = own_kinds or tuple(kind for kind in usual.guidance if kind in possible)

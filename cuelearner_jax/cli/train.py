@@ -69,7 +69,11 @@ class Train(TrainingOptions):
 
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` raises."""
-    usual = lambda grid: {"guidance": asking_kind(grid.guidance), "labels": grid.labels[0]}  # noqa: E731
+    usual = lambda grid: {  # noqa: E731
+        "guidance": asking_kind(grid.guidance),
+        "labels": grid.labels[0],
+        "seed": grid.seeds[0],
+    }
     (options, *others), _ = parse_training(arguments, "train", Train, usual)
     if others:
         names = ", --".join(name for name, _ in options.setting)

@@ -19,7 +19,6 @@ from cuelearner_jax.report.efficiency import Efficiency, Question, efficiency_of
 from cuelearner_jax.report.tables import code, markdown
 from cuelearner_jax.report.variants import Group, PathLike, Variant, read_groups, variants_of
 from cuelearner_jax.storage.folders import in_use
-from cuelearner_jax.task import Task
 
 FILES = [f"{name}.{suffix}" for name in ("curves", "label_efficiency", "profiles") for suffix in ("png", "svg")]
 FILES += [f"{name}.csv" for name in ("summary", "curves", "efficiency", "equal_area", "aggregates", "profiles")]
@@ -78,8 +77,10 @@ class Contents(NamedTuple):
 def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Contents:
     """Read the results of run folders, or of folders above them, and compute what a report shows."""
     metric, split = request.metric, request.split
-    lower_is_better = request.lower_is_better or metric in Task.less_is_better
     groups = read_groups(folders, metric, split, request.by_run, guidance=request.guidance, labels=request.labels)
+    every = pa.concat_tables([group.every for group in groups], promote_options="permissive")  # of other metrics
+    missing, less_is_better = extent.missing(folders, every, split)
+    lower_is_better = request.lower_is_better or metric in less_is_better
     variants = variants_of(groups, metric)
     over = answer = None
     if len({variant.task for variant in variants}) > 1:
@@ -88,9 +89,7 @@ def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Co
         over = None if request.by_run else aggregates.aggregates_of(variants, request.level, lower_is_better)
     elif request.asks:
         answer = efficiency_of(variants, request, lower_is_better)
-    every = pa.concat_tables([group.every for group in groups], promote_options="permissive")  # of other metrics
-    missing = extent.missing(folders, every) + extent.gaps(groups, variants, metric, split)
-    missing += over.missing if over else []
+    missing += extent.gaps(groups, variants, metric, split) + (over.missing if over else [])
     return Contents(groups, variants, tables.summary(variants, lower_is_better), missing, answer, every, over)
 
 

@@ -15,10 +15,14 @@ from cuelearner_jax.report.variants import Group, Variant
 from cuelearner_jax.runs import failures, shards
 from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.folders import CONFIG
+from cuelearner_jax.task import Task
 
 
-def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[str]:
-    """Return one line for everything planned that the table lacks, or whose plan is unknown."""
+def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, split: str) -> tuple[list[str], set[str]]:
+    """Return a line for everything planned that the table of a split lacks, or whose plan is unknown.
+
+    Also return the metrics of which less is better by the runs' tasks, or by default.
+    """
     ends = table.group_by("folder").aggregate([("step", "max")]).to_pylist()
     last = {row["folder"]: row["step_max"] for row in ends}
     # The config.json of a run lies above the folders of its kinds of guidance.
@@ -42,8 +46,11 @@ def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> list[
             lines.append(f"{folder}: not finished, at step {last[folder]:,}")
     lines += shards.missing(sorted(plans))
     for file, plan in plans.items():
-        lines += _absent(file.parent, plan.get("grid", {}), table)
-    return lines
+        if (other := plan.get("split", split)) != split:
+            lines.append(f"{file.parent.as_posix()}: evaluated on {other} episodes, so not in this report")
+        else:
+            lines += _absent(file.parent, plan.get("grid", {}), table)
+    return lines, {name for plan in plans.values() for name in plan.get("less_is_better", ())} | {*Task.less_is_better}
 
 
 def _absent(run: Path, grid: dict[str, Any], table: pa.Table) -> list[str]:

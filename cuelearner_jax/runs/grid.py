@@ -97,6 +97,7 @@ def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from:
         **run_config.to_json(config),
         "grid": {"guidance": list(grid.guidance), "seeds": list(grid.seeds), "labels": list(grid.labels)},
         "split": split,
+        "less_is_better": list(task.less_is_better),
         "labels_from": f"{labels_from.stem} {label_files.digest(labels_from)}" if labels_from else None,
         "total_steps": config.schedule.total_steps,
     }
@@ -104,7 +105,7 @@ def describe(task: Task, config: RunConfig, grid: Grid, split: str, labels_from:
 
 def config_hash(contents: dict[str, Any]) -> str:
     """Return a short hash of what a lane's result depends on: a description without format and other lanes."""
-    apart = ("format", "grid", "shard", "setting")
+    apart = ("format", "grid", "shard", "setting", "less_is_better")
     learned_from = {name: value for name, value in contents.items() if name not in apart}
     task = {name: value for name, value in contents["task"].items() if name != "from"}
     return configuration.digest({**learned_from, "task": task})

@@ -42,7 +42,7 @@ MEANINGS = {  # of columns, by name or pattern; the first that fits
     "asked": "labels asked for so far, answered or not: at most the budget",
     "round": "label rounds of the lanes trained with this lane so far",
     "*.*": "value of an option that varies in a sweep, as `scalars.eps_deg`",
-    "*_each": "means of a metric over up to 20 equal groups of the evaluation's episodes",
+    "*_each": "means of a metric over up to 20 groups of the evaluation's episodes",
     "guide_*": "a metric of the guide alone, without the agent; null where the guide was not measured",
     "train_*": "mean over training since the last evaluation: of the loss, of the reward, ...",
     "*": "a metric: mean over the evaluation's episodes, or steps; null where the value is not finite",

@@ -84,13 +84,16 @@ def test_nothing_is_overwritten_unasked_and_stale_figures_go(runs, tmp_path):
     assert (out / "notes.txt").read_text() == "mine"
 
 
-def test_of_collisions_the_fewest_are_best(tmp_path):
+@pytest.mark.parametrize("metric", ["collision", "duration"])  # by any task, by the run's own
+def test_of_some_metrics_the_least_is_best(metric, tmp_path):
+    (tmp_path / "runs").mkdir()
+    planned(tmp_path / "runs", less_is_better=["duration"])
     for kind, values in (("none", (0.8, 0.5, 0.4)), ("heuristic", (0.8, 0.3, 0.35))):
         constants = {"run": kind, "task": "hall", "guidance": kind, "config_hash": "0f", "labels": 0}
         with TableWriter(tmp_path / "runs" / kind, results.SCHEMA, constants) as writer:
             for step, value in zip((0, 10, 20), values, strict=True):
-                writer.append(step=step, split="validation", seed=[0, 1], collision=[value, value])
-    report([tmp_path / "runs"], tmp_path / "out", ReportRequest(metric="collision"))  # less of it is usually better
+                writer.append(step=step, split="validation", seed=[0, 1], **{metric: [value, value]})
+    report([tmp_path / "runs"], tmp_path / "out", ReportRequest(metric=metric))
     row = summary(tmp_path / "out")["heuristic", 0]
     assert (float(row["best"]), int(row["best_step"]), row["reaches_unguided_final"]) == (0.3, 10, "8")
 
@@ -102,6 +105,8 @@ def test_says_what_is_missing(runs, tmp_path):
     write(runs / "intent", "intent", 0.2, 100, steps=STEPS[1::2])
     (runs / "planned").mkdir()
     planned(runs / "planned")
+    (runs / "tuned").mkdir()
+    planned(runs / "tuned", split="tuning", grid={"guidance": ["none"]})
     write(runs / "sweep" / "demonstration", "demonstration", 0.2, 100, steps=STEPS[:9])
     (runs / "sweep" / "demonstration" / "config.json").unlink()
     grid = {"guidance": ["none", "demonstration"]}
@@ -113,6 +118,7 @@ def test_says_what_is_missing(runs, tmp_path):
     assert "heuristic: a single seed, so there is no interval" in missing
     assert "nan" not in text
     assert "planned: no results" in missing
+    assert "tuned: evaluated on tuning episodes" in missing
     assert "sweep/demonstration: at step 80 of 100 (80%)" in missing
     assert "sweep: no results of none guidance" in missing
     assert "no results of demonstration" not in missing
