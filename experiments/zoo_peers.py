@@ -39,7 +39,14 @@ from cuelearner_jax.policies import Guided, Heuristic
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import Step
 
-SIZES = GuideSizes(feedback_layers=(64, 64), labels_per_round=20, fit_steps=300, fit_batch_size=32, question_every=5)
+SIZES = GuideSizes(
+    normalise_obs=False,
+    feedback_layers=(64, 64),
+    labels_per_round=20,
+    fit_steps=300,
+    fit_batch_size=32,
+    question_every=5,
+)
 KINDS: Mapping[str, type[Guide]] = {
     "relative": registry.find("relative"),
     "demonstration": _residual.Residual,
@@ -56,7 +63,7 @@ SETTINGS = tuple(
 
 
 class Even(WholeObservations, struct.PyTreeNode):
-    """A world of the zoo with actions in half ranges and observations in standard deviations, as networks take them."""
+    """A world of the zoo with actions in half ranges and observations in standard deviations."""
 
     world: zoo.ZooWorld
     mean: Float[Array, " obs"]

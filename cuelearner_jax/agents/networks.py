@@ -27,6 +27,7 @@ from cuelearner_jax.types import Params
 
 RATE = 1e-3  # share of a new batch in running means
 FARTHEST = 10.0  # the largest normalised observation, in standard deviations
+LEAST = 1e-5  # the smallest standard deviation of an observation
 
 
 class Joined(nn.Module):
@@ -117,16 +118,11 @@ def moments_of(obs: Float[Array, "rows obs"], valid: Bool[Array, " rows"]) -> Pa
 
 
 def normalised(obs: Float[Array, "... obs"], moments: Params | None) -> Float[Array, "... obs"]:
-    """Return observations less their mean over their standard deviation, at most `FARTHEST`; as they are without.
-
-    An entry that was constant so far is 0: nothing is known of it.
-    """
+    """Return observations less their mean over their standard deviation, at most `FARTHEST`; as they are without."""
     if moments is None:
         return obs
     mean, variance = (jnp.broadcast_to(moments[name], obs.shape) for name in ("mean", "variance"))
-    varies = variance > jnp.square(1e-6 * mean)
-    away = (obs - mean) / jnp.sqrt(jnp.where(varies, variance, 1.0))
-    return jnp.where(varies, jnp.clip(away, -FARTHEST, FARTHEST), 0.0)
+    return jnp.clip((obs - mean) / jnp.sqrt(jnp.maximum(variance, LEAST**2)), -FARTHEST, FARTHEST)
 
 
 def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32, layer_norm: bool = False) -> MLP:

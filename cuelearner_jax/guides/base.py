@@ -18,15 +18,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
-from cuelearner_jax.guides.fitting import (
-    Example,
-    GuideModel,
-    fit_model,
-    guide_model,
-    silent_cues,
-    squared_errors,
-    with_moments,
-)
+from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, silent_cues, squared_errors
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
@@ -139,8 +131,7 @@ class Guide:
         Examples are never augmented by an environment's symmetries. Where several actions are equally good, a teacher's
         answer in the mirror image is mostly not the mirror image of its answer.
         """
-        rows, losses = self.examples(labels, scalars), partial(self.losses, env, scalars)
-        init = lambda key: with_moments(self.network.init(key), labels.obs, labels.valid)  # noqa: E731
+        rows, losses, init = self.examples(labels, scalars), partial(self.losses, env, scalars), self.network.init
         return fit_model(key, rows, scalars, init=init, losses=losses, sizes=self.sizes, augment=self.augmented)
 
     def losses(self, env: Any, scalars: GuideScalars, params: Params, rows: Any) -> Float[Array, " n"]:

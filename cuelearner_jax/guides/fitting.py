@@ -29,6 +29,7 @@ Init = Callable[[PRNGKeyArray], Params]
 Predict = Callable[[Any, Params, Array, Array], Array]  # (env, params, obs (n, ...), actions (n, ...)) -> (n, outputs)
 Augment = Callable[[PRNGKeyArray, Any], Any]  # (key, batch (n, ...) of rows) -> what to train on in its place
 
+NOTHING = 1e30  # variance by which an entry is left out
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
 
 
@@ -146,11 +147,17 @@ def silent_cues(answers: Float[Array, "n cues"], valid: Bool[Array, " n"]) -> Bo
 
 
 def with_moments(params: Params, obs: Float[Array, "n obs"], rows: Bool[Array, " n"]) -> Params:
-    """Return parameters of a network that sees normalised observations with the moments of some; others as they are."""
-    if "obs" not in params:
+    """Return parameters of a network that sees normalised observations with the moments of some; others as they are.
+
+    An entry that is constant, but for a simulator's jitter or rounding, is left out: nothing is known of it.
+    """
+    if not (isinstance(params, dict) and "obs" in params):
         return params
+    mean, variance = networks.moments_of(obs, rows).values()
+    varies = variance > networks.LEAST**2 + jnp.square(1e-6 * mean)
+    moments = {"mean": mean, "variance": jnp.where(varies, variance, NOTHING)}
     shaped = lambda new, old: jnp.broadcast_to(new, old.shape)  # noqa: E731
-    return {**params, "obs": jax.tree.map(shaped, networks.moments_of(obs, rows), params["obs"])}
+    return {**params, "obs": jax.tree.map(shaped, moments, params["obs"])}
 
 
 def fit_model(
@@ -205,6 +212,8 @@ def fit_model(
         return (running, best, jnp.where(better, score, best_score)), None
 
     params = init(k_init)
+    if hasattr(rows, "obs"):
+        params = with_moments(params, rows.obs, rows.valid)
     keys = jax.random.split(k_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
     start = ((params, adam.init(params)), params, jnp.inf)
     (_, best, score), _ = jax.lax.scan(stretch, start, keys)
