@@ -39,14 +39,8 @@ from cuelearner_jax.policies import Guided, Heuristic
 from cuelearner_jax.spaces import Space
 from cuelearner_jax.types import Step
 
-SIZES = GuideSizes(
-    normalise_obs=False,
-    feedback_layers=(64, 64),
-    labels_per_round=20,
-    fit_steps=300,
-    fit_batch_size=32,
-    question_every=5,
-)
+FITS: dict[str, Any] = {"normalise_obs": False, "fit_steps": 300, "fit_batch_size": 32}
+SIZES = GuideSizes(feedback_layers=(64, 64), labels_per_round=20, question_every=5, **FITS)
 KINDS: Mapping[str, type[Guide]] = {
     "relative": registry.find("relative"),
     "demonstration": _residual.Residual,

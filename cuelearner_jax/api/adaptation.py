@@ -306,7 +306,9 @@ def _labels(
     if before is not None and not names:
         space = logs.space_of(before)
     if space is None:
-        low, high = (None if end is None else numbers("low and high", end).tolist() for end in (low, high))
+        low, high = (
+            None if end is None else np.atleast_1d(numbers("low and high", end)).tolist() for end in (low, high)
+        )
         low, high = logs.bounds_of(np.asarray(rows.action), low, high, note=note)
         space = Box(tuple(low), tuple(high), cues_from(cues) if cues else ())
     external_labels.check(rows, Spaces(rows.obs.shape[1], space), RELATIVE)

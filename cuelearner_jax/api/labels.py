@@ -13,7 +13,7 @@ from cuelearner_jax.api.worlds import numbers
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback import external_labels
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.spaces import says_something
+from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.storage import label_files
 from cuelearner_jax.storage.label_files import LabelFile
 from cuelearner_jax.types import Label
@@ -41,14 +41,22 @@ def rows_of(labels: Labels) -> Label:
 
     Raises UserError unless they are three arrays of one length.
     """
+    if len(labels) != len(Labels._fields):
+        raise UserError(f"labels are {len(labels)} arrays: give observations, actions and answers")
     obs, action, answer = (numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True))
-    if obs.ndim != 2 or not obs.size or action.shape[:1] != (len(obs),) or answer.shape[:1] != (len(obs),):
+    if (
+        obs.ndim != 2
+        or not obs.size
+        or action.ndim != 2
+        or action.shape[:1] != (len(obs),)
+        or answer.shape[:1] != (len(obs),)
+    ):
         raise UserError(
             f"labels have shapes {obs.shape}, {action.shape}, {answer.shape}: give observations (n, obs), "
             "actions (n, action) and answers (n,), or (n, cues) where there are several"
         )
     answer = answer[:, None] if answer.ndim == 1 else answer
-    has_answer = np.asarray(says_something(answer))
+    has_answer = np.asarray(is_answered(answer).any(-1))
     if not has_answer.any():
         raise UserError("labels say nothing of any cue: give labels with answers")
     return Label(obs[has_answer], action[has_answer], answer[has_answer], np.ones(has_answer.sum(), bool))  # pyright: ignore[reportArgumentType]

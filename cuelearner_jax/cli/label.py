@@ -26,6 +26,7 @@ from cuelearner_jax.cli.train import asking_kind
 from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import PROPOSED, actions_of, offers
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.feedback.answers import RELATIVE
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.guides.base import Guide, ReadingGuide
 from cuelearner_jax.labelling import controls
@@ -41,7 +42,7 @@ from cuelearner_jax.storage.folders import claimed
 from cuelearner_jax.studies.adapt import AdaptRequest
 from cuelearner_jax.studies.train import preset_kinds
 from cuelearner_jax.task import PAPER, QUICKSTART, Preset, Task, shape_of
-from cuelearner_jax.tasks import shipped
+from cuelearner_jax.tasks import logs, shipped
 from cuelearner_jax.terminal import Interrupted, console, interruptible
 
 UNIFORM, NEAR_AIMS = "uniform", "near_aims"
@@ -291,7 +292,10 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
         return shlex.join(["cuelearner", "labels", "inspect", str(options.again), out])
     if policy is None and options.questions == PROPOSED and _has_proposals(task, options.task):
         return shlex.join(["cuelearner", "adapt", "--labels-from", out, "--out", f"policies/{Path(out).name}"])
-    if policy is None and options.questions == PROPOSED:
+    is_recorded = task.name == logs.NAME
+    if is_recorded and guidances.resolve(options.guidance).form is not RELATIVE:  # no command adapts to these
+        return shlex.join(["cuelearner", "labels", "inspect", out])
+    if policy is None and (options.questions == PROPOSED or is_recorded):
         return f'cl.correct(policy, "{out}")  # in Python, after: import cuelearner_jax as cl'
     if policy is None:
         words, place, again = ["train", name, "--preset", preset], "runs", ("robot",)
@@ -299,11 +303,11 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
     else:
         is_folder = shipped.is_shipped(policy) or Path(policy).is_dir()
         words, place, again = ["adapt", policy], "policies", ("preset", "scenario", "robot", "changes")
-        words += [] if is_folder and ":" not in name else ["--task", name]
+        words += [] if is_recorded or (is_folder and ":" not in name) else ["--task", name]
         words += ["--base", options.code] if options.code else []
         lane = {key: value for key, value in vars(options.base).items() if value not in (None, ())}
         words += as_options("base", lane)
-        parts = {"task": task.config}
+        parts = {} if is_recorded else {"task": task.config}  # labels hold the world of a recording
     words += [word for option in again if (value := getattr(options, option)) for word in (f"--{option}", value)]
     words += ["--guidance", options.guidance, "--labels-from", out, "--labels", str(labels)]
     for part, kind in parts.items():

@@ -44,7 +44,11 @@ class Inspect:
         for name in dict.fromkeys(name for facts in columns for name in facts):
             table.add_row(name, *(one_line(facts.get(name, "")) for facts in columns))
         if len(files) == 2:
-            table.add_row("agree with each other", str(comparing.between(*files)))
+            try:
+                both = str(comparing.between(*files))
+            except UserError as error:
+                both = f"not compared: {error}"
+            table.add_row("agree with each other", both)
         out.print_table(table)
 
 

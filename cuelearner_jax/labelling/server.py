@@ -71,7 +71,8 @@ def end_session(session: Session, commands: Commands) -> Ending:
     """Finish a session. Raises UserError if its labels cannot be saved; the session then continues."""
     file, status = session.finish().resolve(), session.status()
     also = f", and {status.unsure} questions without an answer" if status.unsure else ""
-    took = f"{int(status.seconds // 60)} min {status.seconds % 60:.0f} s"
+    minutes, seconds = divmod(round(status.seconds), 60)
+    took = f"{minutes} min {seconds} s"
     line = f"{status.answered} of {status.labels} labels are saved{also}, in {file}; the answers took {took}"
     return Ending(line, commands.following(status.answered), commands.again)
 

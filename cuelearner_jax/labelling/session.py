@@ -104,8 +104,10 @@ class Record:
             raise UserError(f"not finished ({error.strerror or error}): make room, then finish again") from error
 
     def close(self) -> None:
-        """Close the file."""
+        """Close the file. One without a response is deleted, so that other words or settings may take its folder."""
         self._writer.close()
+        if not self.rows:
+            self.path.unlink(missing_ok=True)
 
 
 class Status(NamedTuple):
@@ -154,8 +156,6 @@ class Session(AbstractContextManager[Any, None]):
             self.films = self.questions.film(self._items[self.number], self._items[self.number].action) is not None
         except BaseException:
             self.record.close()
-            if not self.record.rows:
-                self.record.path.unlink()
             raise
         self._next: Future[None] = self._ahead.submit(self._prepare, self.number + 1)
         self._since = time.monotonic()

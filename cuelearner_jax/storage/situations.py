@@ -91,6 +91,8 @@ def read(path: Path) -> Situations:
     for name in columns:
         if name not in own and not name.startswith(("observation.", "action.")):
             raise UserError(f"{table} has an unknown column {format_value(name)}: {advice}, or leave it out")
+    if any(isinstance(values, np.ndarray) and not values.ndim for values in columns.values()):
+        raise UserError(f"{table} has a column of a single number: give one for each situation")
     if len({len(values) for values in columns.values()}) > 1:
         raise UserError(f"{table} has columns of several lengths: give an observation and an action for each situation")
     observations, names = _matrix(table, columns, OBSERVATION)

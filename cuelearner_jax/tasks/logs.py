@@ -91,6 +91,8 @@ def space_of(config: LogsConfig) -> Space:
     cues = cues_from(config.cues, config.cue_names, unit) if config.cues else ()
     if cues and config.keys:
         pairs = [tuple(filter(None, pair.split(","))) for pair in config.keys]
+        if len(pairs) != len(cues) or not {*map(len, pairs)} <= {0, 2}:
+            raise UserError(f"task.keys is {' '.join(config.keys)}: give two keys for each of {len(cues)} cues, as q,a")
         cues = tuple(dataclasses.replace(cue, keys=pair) for cue, pair in zip(cues, pairs, strict=True))
     return Choices(len(config.low), *cues) if config.actions == "choices" else Box(config.low, config.high, cues)
 
@@ -307,4 +309,5 @@ LOGS = Task(
     labels_hold=("path", "digest", "rows", "order", "cues", "cue_names", "keys", "centre", "spread"),
     files=lambda config: {"path": config.digest} if config.path else {},
     judge_by=lambda config: LABELS,
+    less_is_better=(*Task.less_is_better, "change"),
 )

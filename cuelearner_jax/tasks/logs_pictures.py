@@ -21,32 +21,37 @@ from cuelearner_jax.storage import situations
 from cuelearner_jax.task import Pictures
 from cuelearner_jax.types import Reel, Sketch
 
-CLIP_FRAMES, CLIP_PERIOD = 60, 0.1  # most frames of a clip, and the time between two of them [s]
+CLIP_FRAMES = 60  # most frames of a clip
+PERIOD = 100  # between two frames of a GIF that says nothing of it [ms]
+BLANK = np.full((240, 320, 3), 255, np.uint8)  # for a row without a picture
 STEP = 0.01  # move by which a picture shows where an axis points [m]
 LEAST_WAY = 0.2  # an axis that appears shorter, beside the longest, points nowhere in a picture
 
 
-def _frames(env: Any, row: Any) -> tuple[list[Any], int]:
-    """Return the frames of a row's picture or clip, and the row's place in the recording."""
+def _frames(env: Any, row: Any) -> tuple[list[Any], int, float]:
+    """Return the frames of a row's picture or clip, the row's place in the recording, and the frames' period [s]."""
     if not env.path:
         raise UserError("these situations are those of labels, without pictures: name their folder, as logs:FOLDER")
     place = int(env.places[row])
     picture = situations.read_once(Path(env.path)).picture(place)
     if picture is None:
-        raise UserError(f"{env.path} has no picture of row {place}: add a column `picture` with the name of its file")
+        return [BLANK], place, 0.0
     if picture.kind.startswith("image/") and picture.kind != "image/gif":
-        return [picture.data], place
+        return [picture.data], place, 0.0
     try:
         suffix = "." + picture.kind.partition("/")[2]
-        film = imageio.mimread(io.BytesIO(picture.data), format=suffix, memtest=False)  # pyright: ignore
+        reader = imageio.get_reader(io.BytesIO(picture.data), format=suffix, mode="I")  # pyright: ignore
+        film, about = [*reader.iter_data()], reader.get_meta_data()
     except Exception as error:  # film readers raise many exception types
         raise UserError(f"a clip cannot be read ({' '.join(str(error).split())[:80]}): give GIF or MP4") from error
     numbers = np.unique(np.linspace(0, len(film) - 1, min(len(film), CLIP_FRAMES)).round().astype(int))
-    return [np.ascontiguousarray(np.asarray(film[number])[..., :3]) for number in numbers], place
+    seconds = len(film) * (1 / about["fps"] if "fps" in about else (about.get("duration") or PERIOD) / 1000)
+    frames = [np.ascontiguousarray(np.asarray(film[number])[..., :3]) for number in numbers]
+    return frames, place, seconds / len(frames)
 
 
 def _sketch(env: Any, state: Any) -> Sketch:
-    frames, place = _frames(env, state.row)
+    frames, place, _ = _frames(env, state.row)
     text = situations.read_once(Path(env.path)).text(place)
     sketch = pictures.sketch(frames[0], f"situation {place}" + (f": {text}" if text else ""))
     for _, (hand, *steps) in _in_cameras(env, state, sketch, lambda hand: hand + STEP * np.eye(3))[:1]:
@@ -90,8 +95,8 @@ def _trails(env: Any, state: Any, actions: Float[Array, "n action"]) -> list[str
 
 
 def _reel(env: Any, state: Any, action: Any) -> Reel | None:
-    frames, _ = _frames(env, state.row)
-    return pictures.clip(frames, CLIP_PERIOD, "as recorded") if len(frames) > 1 else None
+    frames, _, period = _frames(env, state.row)
+    return pictures.clip(frames, period, "as recorded") if len(frames) > 1 else None
 
 
 def _record(env: Any, policy: Any, key: PRNGKeyArray, steps: int) -> tuple[list[Any], list[float]]:

@@ -148,6 +148,8 @@ def test_labels_of_a_file_say_their_own_space_and_strength(better, tmp_path):
     [
         ({"labels": "absent", "low": None, "high": None, "cues": ""}, "no label file at absent"),
         ({"labels": cl.Labels(OTHERS[:20], wanted(OTHERS[:20]), np.zeros((20, 2)))}, r"give \(labels, 3\)"),
+        ({"labels": (OTHERS, wanted(OTHERS))}, "labels are 2 arrays"),
+        ({"labels": cl.Labels(OTHERS, OTHERS[:, 0], OTHERS[:, 0])}, "labels have shapes"),
         ({"low": (0.0,) * 3}, "actions are no vectors between the bounds"),
         ({"low": None}, "high is given alone"),
         ({"cues": "left,right"}, "give one cue an entry"),

@@ -9,6 +9,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+import recorded_situations as recorded
 from sessions import OWN, expert, plan, served
 
 from cuelearner_jax.cli import label, main
@@ -67,7 +68,7 @@ def test_the_page_is_served_to_who_knows_its_address_until_ctrl_c(tmp_path, refu
         assert process.wait(60) == 130
         assert "every answer is in" in process.stderr.read()
     assert not leads_there.exists()
-    assert label_files.history(tmp_path / "labels" / label_files.JSONL) == []
+    assert [*(tmp_path / "labels").glob("labels*")] == []  # nothing was answered
 
 
 @pytest.mark.parametrize(
@@ -147,6 +148,11 @@ def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp
         assert words[words.index(pair[0]) + 1] == pair[1]
     asked, *_ = asked_for(monkeypatch, "billiards", "shipped:billiards", "--scenario", "tilted_table")
     assert (asked.guidance, asked.bound_deg) == ("reading", 0.3)
+    recorded.write(tmp_path / "seen", pictures=False)
+    logged = [str(tmp_path / "seen"), "arm:policy", "--out", str(tmp_path / "labels")]  # whose labels hold the world
+    _, _, commands = asked_for(monkeypatch, *logged)
+    following = f"cuelearner adapt arm:policy --guidance reading --labels-from {tmp_path}/labels --labels 7"
+    assert commands.following(7) == f"{following} --out policies/labels"
     _, _, commands = asked_for(monkeypatch, "navigation", "--robot", "anymal", "--out", str(tmp_path))
     assert "--robot anymal" in commands.following(7)
 

@@ -1,5 +1,6 @@
 """Recorded situations as a task: a walk over all of them, a policy that acts as recorded, pictures, plain values."""
 
+import imageio.v2 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -86,6 +87,8 @@ def test_cues_have_the_words_the_names_of_the_recording_and_keys_of_their_own(fo
     assert len(set(keys)) == 6
     assert not {"a", "d"} & set(keys)  # which stand for the arrows too
     assert [cue.name for cue in logs.space_of(logs.task_of(folder, note=quiet).plain()).cues] == list(recorded.ENTRIES)
+    with pytest.raises(UserError, match="give two keys for each of 3 cues"):
+        logs.space_of(logs.task_of(folder, CUES, **BOUNDS).configure(keys=("q", "a")))
 
 
 def test_bounds_are_those_of_the_recording_and_that_is_told(folder):
@@ -176,3 +179,16 @@ def test_the_picture_of_a_situation_is_its_sketch(folder):
     frames, rewards = drawn.record(env, None, jax.random.key(0), 14)
     assert [int(frame[0, 0, 0]) for frame in frames[:12]] == np.asarray(env.places).tolist()
     assert rewards == [0.0] * 14
+
+
+def test_a_clip_takes_its_time_and_a_row_without_a_picture_is_blank(tmp_path):
+    film = [np.full((12, 16, 3), 2 * number, np.uint8) for number in range(90)]
+    imageio.mimsave(tmp_path / "film.gif", film, duration=50)  # [ms]
+    action = np.array([[-1.0], [1.0]])
+    np.savez(tmp_path / "situations.npz", observation=action, action=action, picture=np.array(["film.gif", ""]))
+    task = logs.task_of(tmp_path, note=quiet)
+    env, drawn = task.environment(task.configure(order="recorded")), task.pictures()
+    reel = drawn.reel(env, at(0), jnp.zeros(1))
+    assert (len(reel.pictures), len(reel.pictures) * reel.period) == (60, pytest.approx(4.5))
+    assert drawn.reel(env, at(1), jnp.zeros(1)) is None
+    assert drawn.sketch(env, at(1)).words == "situation 1"
