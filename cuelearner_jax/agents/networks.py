@@ -27,7 +27,6 @@ from cuelearner_jax.types import Params
 
 RATE = 1e-3  # share of a new batch in running means
 FARTHEST = 10.0  # the largest normalised observation, in standard deviations
-LEAST = 1e-5  # the smallest standard deviation of an observation
 
 
 class Joined(nn.Module):
@@ -103,26 +102,28 @@ def next_moments(before: Params, obs: Float[Array, "batch obs"], count: Int[Arra
 def moments_of(obs: Float[Array, "rows obs"], valid: Bool[Array, " rows"]) -> Params:
     """Return mean and variance of observations in some rows, for `normalised`.
 
-    Rows are added in pairs, so that a seed's last bits do not depend on the seeds beside it.
+    Neighbours are added first, so that the last bits depend neither on seeds beside nor on how many empty rows follow.
     """
 
     def mean(rows: Float[Array, "rows obs"]) -> Float[Array, " obs"]:
         rows = jax.lax.optimization_barrier(jnp.where(valid[:, None], rows, 0.0))
         while len(rows) > 1:
-            half = (len(rows) + 1) // 2
-            rows = rows[:half] + jnp.pad(rows[half:], ((0, 2 * half - len(rows)), (0, 0)))
+            rows = rows[::2] + jnp.pad(rows[1::2], ((0, len(rows) % 2), (0, 0)))
         return rows[0] / jnp.maximum(valid.sum(), 1)
 
     middle = mean(obs)
     return {"mean": middle, "variance": mean(jnp.square(obs - middle[None]))}
 
 
-def normalised(obs: Float[Array, "... obs"], moments: Params | None) -> Float[Array, "... obs"]:
-    """Return observations less their mean over their standard deviation, at most `FARTHEST`; as they are without."""
+def normalised(obs: Float[Array, "... obs"], moments: Params | None, least: float = 1e-8) -> Float[Array, "... obs"]:
+    """Return observations less their mean over their standard deviation, at most `FARTHEST`; as they are without.
+
+    `least`: what is added to variances.
+    """
     if moments is None:
         return obs
     mean, variance = (jnp.broadcast_to(moments[name], obs.shape) for name in ("mean", "variance"))
-    return jnp.clip((obs - mean) / jnp.sqrt(jnp.maximum(variance, LEAST**2)), -FARTHEST, FARTHEST)
+    return jnp.clip((obs - mean) / jnp.sqrt(variance + least), -FARTHEST, FARTHEST)
 
 
 def q_network(layers: Sequence[int], dtype: DTypeLike = jnp.float32, layer_norm: bool = False) -> MLP:

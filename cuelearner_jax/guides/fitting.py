@@ -29,6 +29,7 @@ Init = Callable[[PRNGKeyArray], Params]
 Predict = Callable[[Any, Params, Array, Array], Array]  # (env, params, obs (n, ...), actions (n, ...)) -> (n, outputs)
 Augment = Callable[[PRNGKeyArray, Any], Any]  # (key, batch (n, ...) of rows) -> what to train on in its place
 
+LEAST = 1e-5  # standard deviation of an entry of observations below which it is jitter
 NOTHING = 1e30  # variance by which an entry is left out
 VALIDATION_STRIDE = 5  # every fifth label is a validation label: the 80/20 split of the paper's public code
 
@@ -79,7 +80,7 @@ def guide_model(sizes: GuideSizes, spaces: Spaces, outputs: int | None = None, b
     ) -> Float[Array, "m outputs"]:
         """Return predictions for m situations with an action each, or for one situation with m actions."""
         bare, base = jnp.split(actions, [size], -1)
-        obs = networks.normalised(obs, jax.lax.stop_gradient(params.get("obs")))
+        obs = networks.normalised(obs, jax.lax.stop_gradient(params.get("obs")), 0.0)
         of_obs, of_action = networks.network_inputs(sizes.frame, space, env, obs, bare)
         of_action = jnp.concatenate([of_action, base], -1) if beside else of_action
         return networks.as_function(network)(params, of_obs, of_action)
@@ -154,7 +155,7 @@ def with_moments(params: Params, obs: Float[Array, "n obs"], rows: Bool[Array, "
     if not (isinstance(params, dict) and "obs" in params):
         return params
     mean, variance = networks.moments_of(obs, rows).values()
-    varies = variance > networks.LEAST**2 + jnp.square(1e-6 * mean)
+    varies = variance > LEAST**2 + jnp.square(1e-6 * mean)
     moments = {"mean": mean, "variance": jnp.where(varies, variance, NOTHING)}
     shaped = lambda new, old: jnp.broadcast_to(new, old.shape)  # noqa: E731
     return {**params, "obs": jax.tree.map(shaped, moments, params["obs"])}
