@@ -44,13 +44,7 @@ def rows_of(labels: Labels) -> Label:
     if len(labels) != len(Labels._fields):
         raise UserError(f"labels are {len(labels)} arrays: give observations, actions and answers")
     obs, action, answer = (numbers(f"labels.{name}", part) for name, part in zip(Labels._fields, labels, strict=True))
-    if (
-        obs.ndim != 2
-        or not obs.size
-        or action.ndim != 2
-        or action.shape[:1] != (len(obs),)
-        or answer.shape[:1] != (len(obs),)
-    ):
+    if not (obs.size and obs.ndim == action.ndim == 2 and obs.shape[:1] == action.shape[:1] == answer.shape[:1]):
         raise UserError(
             f"labels have shapes {obs.shape}, {action.shape}, {answer.shape}: give observations (n, obs), "
             "actions (n, action) and answers (n,), or (n, cues) where there are several"

@@ -45,10 +45,9 @@ class Inspect:
             table.add_row(name, *(one_line(facts.get(name, "")) for facts in columns))
         if len(files) == 2:
             try:
-                both = str(comparing.between(*files))
+                table.add_row("agree with each other", str(comparing.between(*files)))
             except UserError as error:
-                both = f"not compared: {error}"
-            table.add_row("agree with each other", both)
+                table.add_row("agree with each other", f"not compared: {error}")
         out.print_table(table)
 
 

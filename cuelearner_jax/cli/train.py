@@ -69,11 +69,10 @@ class Train(TrainingOptions):
 
 def run(arguments: list[str]) -> None:
     """Run the command. Raises what `studies.train.run` raises."""
-    usual = lambda grid: {  # noqa: E731
-        "guidance": asking_kind(grid.guidance),
-        "labels": grid.labels[0],
-        "seed": grid.seeds[0],
-    }
+
+    def usual(grid: Grid) -> dict[str, Any]:
+        return {"guidance": asking_kind(grid.guidance), "labels": grid.labels[0], "seed": grid.seeds[0]}
+
     (options, *others), _ = parse_training(arguments, "train", Train, usual)
     if others:
         names = ", --".join(name for name, _ in options.setting)

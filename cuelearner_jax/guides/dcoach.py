@@ -85,11 +85,11 @@ class DeepCoach(Demonstration):
         """Return the former model, corrected by the new labels in order."""
         rows = self.examples(labels, scalars)
         order, count = jnp.argsort(~rows.valid, stable=True), rows.valid.sum()
-        correct = self.correction(env, labels, rows, order, scalars)
+        correct, obs = self.correction(env, labels, rows, order, scalars), rows.obs[order]
 
         def one(key: PRNGKeyArray, number: Int[Array, ""], coached: Coached) -> Coached:
             so_far = jnp.arange(len(order)) <= number
-            fresh = {name: with_moments(getattr(coached, name), rows.obs[order], so_far) for name in self.learners}
+            fresh = {name: with_moments(getattr(coached, name), obs, so_far) for name in self.learners}
             return correct(key, number, coached.replace(**fresh))
 
         def learn(key: PRNGKeyArray, coached: Coached) -> Coached:

@@ -46,7 +46,8 @@ class ReportRequest(Question):
     split: str = "validation"
     """Evaluation episodes to report: validation or tuning."""
     lower_is_better: bool = False
-    """Smaller values of the metric are better (default: of collision, distance, error, cost, foul and timeout)."""
+    """Smaller values of the metric are better, also where neither the runs' task says so nor its name (as collision,
+    cost, distance, error, foul, timeout)."""
     by_run: bool = False
     """Report each folder separately, under its name, for runs of different configurations. Each is compared with its
     own unguided agents or, without any, with those of the first folder that has some."""
@@ -79,8 +80,8 @@ def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Co
     metric, split = request.metric, request.split
     groups = read_groups(folders, metric, split, request.by_run, guidance=request.guidance, labels=request.labels)
     every = pa.concat_tables([group.every for group in groups], promote_options="permissive")  # of other metrics
-    missing, less_is_better = extent.missing(folders, every, split)
-    lower_is_better = request.lower_is_better or metric in less_is_better
+    plans = extent.plans_of(folders, every)
+    lower_is_better = request.lower_is_better or metric in extent.less_is_better(plans)
     variants = variants_of(groups, metric)
     over = answer = None
     if len({variant.task for variant in variants}) > 1:
@@ -89,7 +90,8 @@ def contents_of(folders: Sequence[PathLike], request: ReportRequest = ALL) -> Co
         over = None if request.by_run else aggregates.aggregates_of(variants, request.level, lower_is_better)
     elif request.asks:
         answer = efficiency_of(variants, request, lower_is_better)
-    missing += extent.gaps(groups, variants, metric, split) + (over.missing if over else [])
+    missing = extent.missing(plans, every, split) + extent.gaps(groups, variants, metric, split)
+    missing += over.missing if over else []
     return Contents(groups, variants, tables.summary(variants, lower_is_better), missing, answer, every, over)
 
 

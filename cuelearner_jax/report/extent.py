@@ -17,40 +17,54 @@ from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.folders import CONFIG
 from cuelearner_jax.task import Task
 
+Plans = dict[Path, dict[str, Any] | UserError]  # what each config.json says, or why it cannot be read
 
-def missing(folders: Sequence[str | os.PathLike[str]], table: pa.Table, split: str) -> tuple[list[str], set[str]]:
-    """Return a line for everything planned that the table of a split lacks, or whose plan is unknown.
 
-    Also return the metrics of which less is better by the runs' tasks, or by default.
-    """
-    ends = table.group_by("folder").aggregate([("step", "max")]).to_pylist()
-    last = {row["folder"]: row["step_max"] for row in ends}
-    # The config.json of a run lies above the folders of its kinds of guidance.
-    places = {folder: (Path(folder) / CONFIG, Path(folder).parent / CONFIG) for folder in last}
-    configurations = {folder: next(filter(Path.exists, own), None) for folder, own in places.items()}
-    files = {file for folder in folders for file in Path(folder).rglob(CONFIG)} | set(configurations.values())
-    plans: dict[Path, dict[str, Any]] = {}
-    lines = []
-    for file in sorted(filter(None, files)):
+def plans_of(folders: Sequence[str | os.PathLike[str]], table: pa.Table) -> Plans:
+    """Return the plans below some folders, and those of the runs that a table holds."""
+    files = {file for folder in folders for file in Path(folder).rglob(CONFIG)}
+    files |= {file for folder in table["folder"].unique().to_pylist() if (file := _plan_above(folder))}
+    plans: Plans = {}
+    for file in sorted(files):
         try:
             plans[file] = formats.read("config", file)
         except UserError as error:
-            lines.append(f"the plan of {file.parent.as_posix()} is unknown: {error}")
-    for folder, file in configurations.items():
+            plans[file] = error
+    return plans
+
+
+def _plan_above(folder: str) -> Path | None:
+    """Return the config.json of a run, which lies above the folders of its kinds of guidance."""
+    return next(filter(Path.exists, (Path(folder) / CONFIG, Path(folder).parent / CONFIG)), None)
+
+
+def less_is_better(plans: Plans) -> set[str]:
+    """Return the metrics of which less is better, by the runs' tasks or by default."""
+    own = [plan.get("less_is_better", ()) for plan in plans.values() if isinstance(plan, dict)]
+    return {*Task.less_is_better}.union(*own)
+
+
+def missing(every: Plans, table: pa.Table, split: str) -> list[str]:
+    """Return a line for everything planned that the table of a split lacks, or whose plan is unknown."""
+    plans = {file: plan for file, plan in every.items() if isinstance(plan, dict)}
+    unknown = [(file.parent.as_posix(), why) for file, why in every.items() if file not in plans]
+    lines = [f"the plan of {folder} is unknown: {why}" for folder, why in unknown]
+    for row in table.group_by("folder").aggregate([("step", "max")]).to_pylist():
+        folder, last, file = row["folder"], row["step_max"], _plan_above(row["folder"])
         total = plans[file].get("total_steps") if file in plans else None
         if file is None:
-            lines.append(f"{folder}: has no config.json, so its plan is unknown; at step {last[folder]:,}")
-        elif total is not None and last[folder] < total:
-            lines.append(f"{folder}: at step {last[folder]:,} of {total:,} ({last[folder] / total:.0%})")
+            lines.append(f"{folder}: has no config.json, so its plan is unknown; at step {last:,}")
+        elif total is not None and last < total:
+            lines.append(f"{folder}: at step {last:,} of {total:,} ({last / total:.0%})")
         elif total is None and not (Path(folder) / results.PARQUET).exists():
-            lines.append(f"{folder}: not finished, at step {last[folder]:,}")
+            lines.append(f"{folder}: not finished, at step {last:,}")
     lines += shards.missing(sorted(plans))
     for file, plan in plans.items():
         if (other := plan.get("split", split)) != split:
             lines.append(f"{file.parent.as_posix()}: evaluated on {other} episodes, so not in this report")
         else:
             lines += _absent(file.parent, plan.get("grid", {}), table)
-    return lines, {name for plan in plans.values() for name in plan.get("less_is_better", ())} | {*Task.less_is_better}
+    return lines
 
 
 def _absent(run: Path, grid: dict[str, Any], table: pa.Table) -> list[str]:

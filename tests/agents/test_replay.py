@@ -57,8 +57,8 @@ def test_in_lanes_the_write_stays_one_slice_update():
     rows = jnp.stack([buffer.empty(6), buffer.empty(6)])
     lanes = jax.tree.map(lambda *leaves: jnp.stack(leaves), numbered(10, 2), numbered(20, 2))
     add = jax.vmap(buffer.add, (0, None, 0))
-    found = add(rows, jnp.array(10), lanes)[:, :, 0]
-    np.testing.assert_array_equal(found, [[0, 0, 0, 0, 10, 11], [0, 0, 0, 0, 20, 21]])
+    column = add(rows, jnp.array(10), lanes)[:, :, 0]
+    np.testing.assert_array_equal(column, [[0, 0, 0, 0, 10, 11], [0, 0, 0, 0, 20, 21]])
     program = str(jax.make_jaxpr(add)(rows, jnp.array(10), lanes))
     assert "dynamic_update_slice" in program
     assert "scatter" not in program

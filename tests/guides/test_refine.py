@@ -81,8 +81,8 @@ def test_agrees_with_a_float64_loop(scale, tau_deg, tau_max_deg, k_max):
 
 def test_passes_between_two_looks_change_nothing(monkeypatch):
     weights, first, some = network(20, 0.2), starts(1), np.arange(ROWS) % 3 > 0
-    given = (weights, first, some, 0.5 * DEG, math.pi, 50)
-    each = refined_by_network(*given)
+    inputs = (weights, first, some, 0.5 * DEG, math.pi, 50)
+    each = refined_by_network(*inputs)
     asked = []
 
     def seven_passes():
@@ -91,7 +91,7 @@ def test_passes_between_two_looks_change_nothing(monkeypatch):
 
     monkeypatch.setattr(refining, "portions", seven_passes)
     # A new function: of the same one JAX would run the trace with one pass again.
-    several = jax.jit(functools.partial(refine_by_network))(*given)
+    several = jax.jit(functools.partial(refine_by_network))(*inputs)
     assert asked
     np.testing.assert_array_equal(several.passes, each.passes)
     np.testing.assert_allclose(several.actions, each.actions, atol=1e-6)

@@ -119,9 +119,9 @@ def test_networks_see_entries_of_the_order_of_one(folder):
     task = logs.task_of(folder, CUES, **BOUNDS)
     view = task.view(task.plain())
     first, high = jnp.asarray(observations[0]), jnp.asarray(recorded.HIGH)
-    seen = np.asarray(jax.vmap(lambda obs: view.features(obs, high).own)(jnp.asarray(observations)))
-    np.testing.assert_allclose(seen.mean(0), 0.0, atol=1e-5)
-    np.testing.assert_allclose(seen.std(0), 1.0, atol=1e-5)
+    scaled = np.asarray(jax.vmap(lambda obs: view.features(obs, high).own)(jnp.asarray(observations)))
+    np.testing.assert_allclose(scaled.mean(0), 0.0, atol=1e-5)
+    np.testing.assert_allclose(scaled.std(0), 1.0, atol=1e-5)
     np.testing.assert_allclose(view.features(first, high).turned, 1.0, atol=1e-6)
     np.testing.assert_allclose(view.features(first, jnp.asarray([recorded.LOW] * 2)).turned, -1.0, atol=1e-6)
 
