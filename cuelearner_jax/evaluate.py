@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 from jax.sharding import Mesh
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -152,6 +153,12 @@ def mean_interval(values: Float[np.ndarray, "*lanes n"], resamples: int = RESAMP
         rows = random.integers(0, count, (min(together, resamples - first), count))
         means.append(np.moveaxis(values[..., rows].mean(-1), -1, 0))
     return np.stack([mean, *np.quantile(np.concatenate(means), [0.025, 0.975], axis=0)])
+
+
+def extreme_share(value: float, count: int) -> tuple[float, float, float]:
+    """Return a share of none (0) or all (1) of so many, with its 95% interval by Jeffreys' prior."""
+    certain = float(scipy.special.betaincinv(count + 0.5, 0.5, 0.05))
+    return (1.0, certain, 1.0) if value else (0.0, 0.0, 1 - certain)
 
 
 GROUPS = 20  # most groups of episodes whose means an evaluation keeps

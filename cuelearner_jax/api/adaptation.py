@@ -270,7 +270,8 @@ def agreement(
         policy: any policy that `correct` takes or returns.
         labels: answers that the policy was not corrected by, as `correct` takes them.
         base: the policy as it was (default: what a corrected policy corrects).
-        eps: strength of an answer (default: the file's, that of `correct` or `adapt`, or 1/36 of the range).
+        eps: strength of an answer (default: the file's, that of `correct` or `adapt`, or of a policy that was not
+            corrected 1/36 of the range).
         space: space of the actions (default: the file's, or that of the corrected policy).
     """
     own = as_policy(policy)
@@ -281,7 +282,10 @@ def agreement(
     file = _labels(labels, space)
     if eps is None and (eps := file.eps) is None:
         source = policy.outcome.request if isinstance(policy, AdaptedPolicy) else own
-        eps = float((getattr(source, "scalars", None) or plain_scalars(file.space)).eps_deg)
+        scalars = getattr(source, "scalars", None)
+        if scalars is None and getattr(own, "base", None) is not None:
+            raise UserError("eps is None, and a loaded reading no longer knows how strong its answers were: give eps=")
+        eps = float((scalars or plain_scalars(file.space)).eps_deg)
     base = getattr(own, "base", None) if base is None else as_policy(base)
     base = None if base is None else policy_of(base, file.space)
     return agreement_of(policy_of(own, file.space), file.labels, file.space, eps, base)

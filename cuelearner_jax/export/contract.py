@@ -73,7 +73,7 @@ def write(
         inputs, outputs, base = getattr(env, "alone", ([env.obs_size], [actions_of(env).size], {}))
         traced = trace_policy(policy, env.obs_size)
         file, contents, about = _artefact(format, policy, traced, inputs, outputs)
-        golden, cases = golden_cases(policy, draw(), traced), io.BytesIO()
+        golden, cases = golden_cases(policy, draw(), traced, actions_of(env).to_json()), io.BytesIO()
         np.savez(cases, obs=golden.obs, actions=golden.actions)
         files = {file: contents, runner.GOLDEN: cases.getvalue(), "decide.py": inspect.getsource(runner).encode()}
         ends = list(itertools.accumulate(quantity.size for quantity in env.observation))

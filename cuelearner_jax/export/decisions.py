@@ -16,10 +16,10 @@ from cuelearner_jax.environment import Environment
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.export import rules  # noqa: F401  # registers the rules of `trace`
 from cuelearner_jax.export.graph import Traced, trace
-from cuelearner_jax.export.runner import compile_ops
+from cuelearner_jax.export.runner import compile_ops, units
 from cuelearner_jax.policies import Policy, describe, layers, policy_name
 
-TOLERANCE = 1e-5  # largest allowed difference of an entry on another machine, of one above 1 as a share of it
+TOLERANCE = 1e-5  # largest allowed difference of an entry on another machine, in `runner.units`
 NUDGE = 1e-6  # relative change of an observation's entry, as large as rounding may cause
 NUDGES, CASES, MIXED = 4, 64, 5
 ROUNDING = 1e-6  # relative error of an operation, larger than any library's
@@ -92,7 +92,7 @@ def extreme_observations(obs: Float[np.ndarray, "n obs"]) -> Float[np.ndarray, "
     return np.concatenate([rows, np.take_along_axis(rows, mixed, 0)])
 
 
-def is_steady(traced: Traced, obs: Float[np.ndarray, " obs"]) -> bool:
+def is_steady(traced: Traced, obs: Float[np.ndarray, " obs"], space: dict[str, Any]) -> bool:
     """Return whether a graph's decision stays when every inexact operation errs as by rounding.
 
     Entries far outside swallow all others, so that values tie for JAX, which nudged observations do not show.
@@ -108,12 +108,15 @@ def is_steady(traced: Traced, obs: Float[np.ndarray, " obs"]) -> bool:
                 error = size * random.uniform(-1, 1, value.shape) * (np.abs(value).max() if name in SUMS else value)
                 values[outputs[0]] = np.asarray(value + error, np.float32)
         actions.append(values[result])
-    return bool((np.ptp(actions, axis=0) / np.maximum(np.abs(actions[0]), 1)).max() <= TOLERANCE)
+    return bool((np.ptp(actions, axis=0) / units(actions[0], space)).max() <= TOLERANCE)
 
 
-def golden_cases(policy: Policy, candidates: Float[np.ndarray, "n obs"], traced: Traced, most: int = CASES) -> Golden:
+def golden_cases(
+    policy: Policy, candidates: Float[np.ndarray, "n obs"], traced: Traced, space: dict[str, Any], most: int = CASES
+) -> Golden:
     """Return the first observations whose decision does not change under perturbations as small as rounding.
 
+    `space`: that of actions, as the contract describes it.
     An argmax jumps where two values tie, and another machine may choose the other one, so such cases verify nothing.
     Up to a quarter of the cases are extreme observations, where a policy may give no action; none if its graph is
     incomplete.
@@ -129,11 +132,11 @@ def golden_cases(policy: Policy, candidates: Float[np.ndarray, "n obs"], traced:
     for _ in range(NUDGES):
         nudge = NUDGE * random.uniform(-1, 1, obs.shape) * np.maximum(np.abs(obs), 1.0)
         nudged = np.asarray(decide(jnp.asarray(obs + nudge, jnp.float32)))
-        apart = np.maximum(apart, (np.abs(nudged - actions) / np.maximum(np.abs(actions), 1)).max(-1))
+        apart = np.maximum(apart, (np.abs(nudged - actions) / units(actions, space)).max(-1))
     steady = apart <= TOLERANCE  # never where an action is not finite
     with np.errstate(all="ignore"):
         for place in range(len(candidates), len(obs)):  # zero is no direction
-            steady[place] &= actions[place].any() and is_steady(traced, obs[place])
+            steady[place] &= actions[place].any() and is_steady(traced, obs[place], space)
     count, extreme = int(steady[: len(candidates)].sum()), int(steady[len(candidates) :].sum())
     if not count:
         why = f"all {len(candidates)} decisions change with the last digits of their observation"

@@ -104,7 +104,7 @@ class Decision:
         return parts
 
     def check(self) -> float:
-        """Recompute the golden cases; return the largest difference of an entry, if above 1 as a share of the entry.
+        """Recompute the golden cases; return the largest difference of an entry in its `units`.
 
         Raises ContractError if the difference is larger than the contract allows.
         """
@@ -112,7 +112,7 @@ class Decision:
             obs, actions = golden["obs"], golden["actions"]
         own, *bases = np.split(obs, [self._size + self._base * number for number in range(self._calls)], 1)
         result = np.concatenate([self(own, *bases), *(self.base_observations(own) if self._questions else [])], -1)
-        difference = float((np.abs(result - actions) / np.maximum(np.abs(actions), 1)).max())
+        difference = float((np.abs(result - actions) / units(actions, self.contract["action"]["space"])).max())
         allowed = self.contract["golden"]["tolerance"]
         if not difference <= allowed:
             raise ContractError(
@@ -120,6 +120,14 @@ class Decision:
                 f"{difference:.2g}, more than {allowed:g}; export it anew, or with --format stablehlo"
             )
         return difference
+
+
+def units(actions: np.ndarray, space: dict[str, Any]) -> np.ndarray:
+    """Return what differences of entries count in: an action's range in a box, else 1, or an entry that is larger."""
+    sizes = np.maximum(np.abs(actions), 1)
+    ranges = np.subtract(space.get("high", ()), space.get("low", ()))
+    sizes[..., : len(ranges)] = ranges
+    return sizes
 
 
 def _numbers(obs: Any) -> np.ndarray:

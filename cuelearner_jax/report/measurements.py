@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.stats
 
 from cuelearner_jax import config
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import group_means, mean_interval
+from cuelearner_jax.evaluate import extreme_share, group_means, mean_interval
 from cuelearner_jax.report.statistics import Interval, interquartile_mean, interval, resampled
 from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
@@ -40,8 +39,7 @@ def spread(row: Measured, metric: str) -> Interval | None:
     each = row.each[metric][:1] if is_single(row) else row.each[metric]
     no_shares = ("reward", "return") if "return" in row.metrics else ()
     if metric not in no_shares and each.min() == each.max() and each.min() in (0, 1) and each.shape[-1] > 1:
-        certain = float(scipy.stats.beta.ppf(0.05, each.shape[-1] + 0.5, 0.5))
-        return Interval(*map(np.asarray, (1.0, certain, 1.0) if each.min() else (0.0, 0.0, 1 - certain)))
+        return Interval(*map(np.asarray, extreme_share(each.min(), each.shape[-1])))
     return Interval(*mean_interval(each[0])) if is_single(row) else interval(row.metrics[metric], group_means(each))
 
 

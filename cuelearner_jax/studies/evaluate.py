@@ -20,7 +20,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.devices import release_programs
 from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, ignore_progress, mean_interval, part_of, rollout_lanes
+from cuelearner_jax.evaluate import episodes, extreme_share, ignore_progress, mean_interval, part_of, rollout_lanes
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in, policy_name
@@ -149,7 +149,7 @@ def run(
 
 
 class Agreement(NamedTuple):
-    """Shares of answers, with 95% bootstrap intervals over labels."""
+    """Shares of answers, with 95% intervals over labels: by the bootstrap, of all or none by Jeffreys' prior."""
 
     labels: int
     policy: Share  # answers that the policy agrees with
@@ -166,7 +166,7 @@ class Agreement(NamedTuple):
     def words(self) -> list[str]:
         """Return the agreement in words, line by line."""
         lines = ["{}: {:.3f} [{:.3f}, {:.3f}]".format(name, *share) for name, share in self.rows()]
-        return [*lines, f"shares of the answers of {self.labels} labels, with 95% bootstrap intervals over labels"]
+        return [*lines, f"shares of the answers of {self.labels} labels, with 95% intervals over labels"]
 
 
 def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = None) -> Agreement:
@@ -185,15 +185,15 @@ def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = No
         own = 0 if policy is None else _answers_of(policy, rows, space, eps)
         return ((own == answers) & counts).sum(-1) / counts.sum(-1)
 
-    def interval(values: Float[np.ndarray, " labels"]) -> Share:
+    def interval(values: Float[np.ndarray, " labels"], is_share: bool = True) -> Share:
         estimate, low, high = (float(value) for value in mean_interval(values))
-        return estimate, low, high
+        return extreme_share(estimate, len(values)) if is_share and low == high in (0, 1) else (estimate, low, high)
 
     own, right = agreed(policy), agreed(None)
     if base is None:
         return Agreement(len(own), interval(own), interval(right))
     before = agreed(base)
-    return Agreement(len(own), *map(interval, (own, right, before, own - before)))
+    return Agreement(len(own), *map(interval, (own, right, before)), interval(own - before, is_share=False))
 
 
 def _answers_of(policy: Any, rows: Label, space: Space, eps: float) -> Float[np.ndarray, "labels cues"]:

@@ -6,6 +6,7 @@ Written for playground 0.2.0, which downloads the robots of its locomotion and m
 from __future__ import annotations
 
 import dataclasses
+import json
 import warnings
 from dataclasses import dataclass
 from functools import cache, partial
@@ -23,6 +24,7 @@ from cuelearner_jax.task import QUICKSTART, Body, Task
 from cuelearner_jax.tasks.presets import quickstart, read
 
 Backend = Literal["generalized", "spring", "positional", "mjx"]
+VARIANTS = {"brax": "backend", "playground": "overrides"}  # each family's field of an environment's variant
 
 
 @dataclass(frozen=True)
@@ -53,34 +55,42 @@ class BraxConfig(SimulatorConfig):
     """Physics backend of brax."""
 
 
+@dataclass(frozen=True)
+class PlaygroundConfig(SimulatorConfig):
+    """Configuration of a Playground environment. Every field is an option `--task.…`; its docstring is the help."""
+
+    overrides: tuple[str, ...] = ()
+    """Changed entries of its own configuration, each as ENTRY=VALUE in JSON: push_config.enable=false."""
+
+
 class Simulator(NamedTuple):
     """Makes the simulator of a name; equal instances return one object, and so share compilations."""
 
     family: str
     environment: str
-    backend: str
+    variant: Any  # brax's backend, or Playground's overrides
     layout: Interface
 
     def __call__(self) -> Any:
         """Return the simulator. Raises UserError if its library has none, or one of another layout."""
-        if _layout(self.family, self.environment, self.backend) != self.layout:
+        if _layout(self.family, self.environment, self.variant) != self.layout:
             raise UserError(
                 f"{self.family}:{self.environment} has other observations or actions than its configuration: name the "
                 f"task {self.family}:{self.environment}, and install the {self.family} of the policy"
             )
-        return _simulator(self.family, self.environment, self.backend)
+        return _simulator(self.family, self.environment, self.variant)
 
 
 @cache
-def _layout(family: str, name: str, backend: str) -> Interface:
-    return layout_of(_simulator(family, name, backend), name)
+def _layout(family: str, name: str, variant: Any) -> Interface:
+    return layout_of(_simulator(family, name, variant), name)
 
 
 @cache
-def _simulator(family: str, name: str, backend: str) -> Any:
+def _simulator(family: str, name: str, variant: Any) -> Any:
     # An environment holds arrays, and the caller may be tracing.
     with jax.ensure_compile_time_eval():
-        return _from_brax(name, backend) if family == "brax" else _from_playground(name)
+        return (_from_brax if family == "brax" else _from_playground)(name, variant)
 
 
 def _from_brax(name: str, backend: str) -> Any:
@@ -94,15 +104,25 @@ def _from_brax(name: str, backend: str) -> Any:
         return envs.get_environment(name, backend=backend)
 
 
-def _from_playground(name: str) -> Any:
+def _from_playground(name: str, overrides: tuple[str, ...]) -> Any:
     try:
         from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         raise UserError("tasks of playground need an extra: pip install 'cuelearner-jax[playground]'") from None
     if name not in registry.ALL_ENVS:
         raise UserError(f"playground has no environment {name!r}{suggestion(name, registry.ALL_ENVS)}")
+    config = registry.get_default_config(name).lock()
+    for override in ('impl="jax"', *overrides):
+        entry, _, value = override.partition("=")
+        try:
+            config.update_from_flattened_dict({entry: json.loads(value)})
+        except (ValueError, KeyError, TypeError) as error:
+            raise UserError(
+                f"--task.overrides has {override!r}: give an entry of playground:{name}'s configuration with a value "
+                "in JSON, such as push_config.enable=false"
+            ) from error
     try:
-        return registry.load(name, config_overrides={"impl": "jax"})
+        return registry.load(name, config)
     except AttributeError as error:  # MuJoCo's own interface has changed
         raise UserError(f"playground:{name} fails with the installed MuJoCo ({error}): choose another task") from error
 
@@ -117,29 +137,29 @@ def make_environment(family: str, config: Any, split: str = "training") -> JaxEn
         )
     slices = zip(config.slices, config.slice_sizes, strict=True)
     layout = Interface(tuple(Quantity(name, size, UNKNOWN_UNIT) for name, size in slices), config.entries)
-    simulator = Simulator(family, config.environment, getattr(config, "backend", ""), layout)
+    simulator = Simulator(family, config.environment, getattr(config, VARIANTS[family]), layout)
     return JaxEnvironment(jnp.array(config.max_steps, jnp.int32), simulator, layout.observation, layout.box())
 
 
-def _family(name: str, about: str, physics: str, config: type, *labels_hold: str) -> Task:
+def _family(name: str, about: str, physics: str, config: type) -> Task:
     pictures = partial(resolve_name, "cuelearner_jax.tasks.frames:SIMULATOR")  # takes seconds to load
     body = Body(name, physics, partial(make_environment, name), pictures=pictures)
-    return Task(name, f"{about} for instance", config, (body,), labels_hold=("max_steps", *labels_hold))
+    return Task(name, f"{about} for instance", config, (body,), labels_hold=("max_steps", VARIANTS[name]))
 
 
 # A label depends on one observation only.
-BRAX = _family("brax", "brax's environments, each as brax:NAME, brax:pusher", "brax's own", BraxConfig, "backend")
+BRAX = _family("brax", "brax's environments, each as brax:NAME, brax:pusher", "brax's own", BraxConfig)
 PLAYGROUND = _family(
     "playground",
     "MuJoCo Playground's environments, each as playground:NAME, playground:CartpoleBalance",
     "MJX, MuJoCo in JAX",
-    SimulatorConfig,
+    PlaygroundConfig,
 )
 
 
 def _task_of(family: Task, name: str) -> Task:
     """Return the task of an environment with its whole box of actions. Raises UserError for an unknown name."""
-    layout = _layout(family.name, name, getattr(family.config, "backend", ""))
+    layout = _layout(family.name, name, getattr(family.config, VARIANTS[family.name]))
     names, sizes, *_ = zip(*layout.observation, strict=True)
     config = family.config(name, slices=names, slice_sizes=sizes, entries=layout.entries)
     presets = read("other", config, layout.box())["presets"]

@@ -66,7 +66,7 @@ def test_what_policies_look_at_needs_no_simulator(monkeypatch):
     monkeypatch.setattr(simulators, "_simulator", nothing)
     env = registry.find("brax").view(FAST.plain())
     assert (env.obs_size, env.actions.size) == (2, 1)
-    config = simulators.SimulatorConfig("Any", slices=("a", "b"), slice_sizes=(2, 3), entries=("x",))
+    config = simulators.PlaygroundConfig("Any", slices=("a", "b"), slice_sizes=(2, 3), entries=("x",))
     assert shape_of(registry.find("playground"), config).obs_size == 5
 
 
@@ -102,8 +102,11 @@ def test_a_simulator_of_another_layout_is_refused():
 @pytest.mark.long
 def test_cartpole_is_that_of_playground_step_for_step():
     suite = pytest.importorskip("mujoco_playground").dm_control_suite
-    world = cl.make("playground:CartpoleBalance", max_steps=4)
+    world = cl.make("playground:CartpoleBalance", max_steps=4, overrides=("ctrl_dt=0.02",))
     assert [cue.name for cue in world.actions.cues] == ["slide"]
-    simulator = suite.load("CartpoleBalance", config_overrides={"impl": "jax"})
-    same_steps(dataclasses.replace(world, config=world.task.plain()), simulator, 5, tolerance=1e-4)
+    simulator = suite.load("CartpoleBalance", config_overrides={"impl": "jax", "ctrl_dt": 0.02})
+    same_steps(dataclasses.replace(world, config=dataclasses.replace(world.config, max_steps=1000)), simulator, 5, 1e-4)
+    for wrong in ("ctrl_dt=fast", "ctrl=0.02", "ctrl_dt"):
+        with pytest.raises(UserError, match=re.escape(f"--task.overrides has {wrong!r}")):
+            cl.make("playground:CartpoleBalance", overrides=(wrong,)).reset(jax.random.key(0))
     check_environment(world.env, 8, tolerance=1e-4)

@@ -190,6 +190,8 @@ def test_beams_have_the_angle_between_them():
 
 
 BOX = spaces.Box(-1, 1, (1,), np.float32)
+# `Nested` as its dictionary is written, not as it is flattened
+AS_WRITTEN = [("wheels.0", 2, "1"), ("wheels.1", 3, "1"), ("arm", 4, "1"), ("lights", 2, "1"), ("modes", 5, "1")]
 
 
 # --- wrong calls and wrong environments ------------------------------------------------------------------------------
@@ -206,6 +208,7 @@ BOX = spaces.Box(-1, 1, (1,), np.float32)
         ({"env": Adder, "observation": [("total", 2, "m", "", "", 0.0, (0.0, 0.0))]}, "observation has an origin"),
         ({"env": Adder, "observation": [("total", 2, "m", "", "beams x")]}, "slice_kinds is .*beams x.*: give a size"),
         ({"env": Adder, "observation": [("total", 3, "m")]}, "names 3 entries, and .*Adder has 2"),
+        ({"env": Nested, "observation": AS_WRITTEN}, "another order or size than .*Nested's vector"),
         ({"env": Adder, "units": {"observation": "metres"}}, "unit of 'observation' is 'metres': give a symbol, as m"),
     ],
 )

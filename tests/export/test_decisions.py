@@ -186,15 +186,21 @@ def test_what_only_stablehlo_can_say_is_refused_of_the_others(tmp_path):
     assert write(policy, "stablehlo", tmp_path / "out")["difference"] == 0.0
 
 
+def test_differences_count_by_the_range_of_an_action_and_by_a_larger_entry_of_a_question():
+    """As of a correction alone: an action in a box, then an observation for the base."""
+    rows = np.array([[400.0, -0.01, 0.5, -30.0]])
+    np.testing.assert_allclose(runner.units(rows, {"low": [0, -0.02], "high": [500, 0.01]}), [[500, 0.03, 1, 30]])
+
+
 def test_golden_cases_are_those_that_rounding_does_not_turn():
     """A policy that jumps at the context (1, 0): only observations far from the jump are kept."""
     policy = Opaque(lambda obs: jnp.where(obs[:, 1:] > 0, 1.0, -1.0) * jnp.array([[0.6, 0.8]]))
     drawn = np.concatenate([np.stack([np.ones(20), np.linspace(-1e-8, 1e-8, 20)], -1), DRAWN[1:]]).astype(np.float32)
-    golden = decisions.golden_cases(policy, drawn, decisions.trace_policy(policy, 2))
+    golden = decisions.golden_cases(policy, drawn, decisions.trace_policy(policy, 2), {})
     assert golden.candidates == len(drawn)
     assert len(DRAWN) - 1 <= golden.steady <= len(DRAWN) + 8  # of the twenty near the jump, chance may leave a few
     with pytest.raises(UserError, match="change with the last digits"):
-        decisions.golden_cases(policy, drawn[9:11], decisions.trace_policy(policy, 2))
+        decisions.golden_cases(policy, drawn[9:11], decisions.trace_policy(policy, 2), {})
 
 
 def test_a_difference_that_no_episode_leads_to_is_noticed_when_the_file_is_written(tmp_path, monkeypatch):
