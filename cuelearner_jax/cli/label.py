@@ -122,17 +122,23 @@ def run(arguments: list[str]) -> None:
 def _defaults(
     task: Task, preset: Preset, source: PolicySource | None, ahead: Namespace, policy: str | None
 ) -> LabelOptions:
-    """Return the default options; labels that are to correct a policy are asked for as `adapt` corrects it."""
-    config = source.config if source else preset.config
-    reads = policy is not None or _has_proposals(task, config.task)
+    """Return the default options; labels that are to correct a policy are asked for as `adapt` corrects it.
+
+    Those of a second opinion are the first one's.
+    """
+    config, again = source.config if source else preset.config, ahead.again and label_files.read(Path(ahead.again))
+    reads = policy is not None or (not again and _has_proposals(task, config.task))
     kind = ReadingGuide.name if reads else asking_kind(preset_kinds(task, preset))
     adapts = policy is not None or task.proposed is not None
     usual = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
     request = AdaptRequest.of(task, config, ahead.scenario, ahead.guidance[0] if ahead.guidance else kind)
+    world = configuration.from_json(task.config, again.task) if again else request.task
+    scalars = _values(GuideScalars, (request if adapts else config).scalars)
+    scalars |= {"eps_deg": again.eps} if again and again.eps is not None else {}
     return LabelOptions(
-        task=request.task if ahead.cues is None else with_cues(task, request.task, ahead.cues),
+        task=world if ahead.cues is None else with_cues(task, world, ahead.cues),
         sizes=GuideSizes(**_values(GuideSizes, (request if adapts else config).sizes)),
-        scalars=GuideScalars(**_values(GuideScalars, (request if adapts else config).scalars)),
+        scalars=GuideScalars(**scalars),
         out=Path("labels") / task.name,
         guidance=kind,
         bound_deg=next(iter(request.bound_deg), None) if adapts else None,

@@ -32,6 +32,8 @@ class Inspect:
     """Label files, or folders of label files. Two files are also compared on the questions that both answered."""
     teacher: Flag[bool] = False
     """Also ask the task's teacher a page's questions (takes a while, since all situations are replayed)."""
+    task: str | None = None
+    """Task of your own whose teacher is asked, as package.module:NAME."""
 
     def run(self) -> None:
         """Print a table with a column a file."""
@@ -40,7 +42,7 @@ class Inspect:
         columns = [_facts(file) for file in files]
         if self.teacher:
             for path, file, facts in zip(self.files, files, columns, strict=True):
-                facts["agrees with the teacher"] = _with_teacher(path, file)
+                facts["agrees with the teacher"] = _with_teacher(path, file, self.task)
         for name in dict.fromkeys(name for facts in columns for name in facts):
             table.add_row(name, *(one_line(facts.get(name, "")) for facts in columns))
         if len(files) == 2:
@@ -64,10 +66,13 @@ class Merge:
         """Write the file. Raises UserError for files that do not fit together."""
         if self.out is None or self.out.suffix != ".parquet":
             raise UserError("merge needs --out: give it a name that ends in .parquet")
-        file, left_out = comparing.merge([comparing.read_checked(path) for path in self.files])
+        files = [comparing.read_checked(path) for path in self.files]
+        file, left_out = comparing.merge(files)
         sources = [f"{path.name} {label_files.digest(path)}" for path in self.files]
         label_files.write_file(self.out, file, merged_from=sources)
         twice = f"; {left_out} duplicates of an earlier file's labels were left out" if left_out else ""
+        if file.people is None and any(one.people for one in files):
+            twice += "; without names and times, which not all files have"
         out.print(f"wrote {len(file.seeds)} labels of {len(self.files)} files to {self.out}{twice}")
 
 
@@ -103,7 +108,8 @@ def _facts(file: LabelFile) -> dict[str, str]:
         facts |= {"fitted meanwhile": str(of("guidance")), "seed": str(of("seed"))}
     if file.people is not None:
         seconds = np.asarray(file.people.seconds, float)
-        pace = f"{60 * len(seconds) / seconds.sum():.1f}" if seconds.sum() > 0 else ""
+        spent = (file.counts or {}).get("seconds") or seconds.sum()  # also on answers that do not count
+        pace = f"{60 * len(seconds) / spent:.1f}" if spent > 0 else ""
         facts |= {
             "by": ", ".join(f"{who} ({count})" for who, count in Counter(file.people.who.tolist()).items()),
             "given": f"{min(file.people.when)} to {max(file.people.when)}",
@@ -113,9 +119,10 @@ def _facts(file: LabelFile) -> dict[str, str]:
     return facts
 
 
-def _with_teacher(path: Path, file: LabelFile) -> str:
+def _with_teacher(path: Path, file: LabelFile, own: str | None) -> str:
     """Return how often the answers are those of the task's teacher. Raises UserError where no page asked them."""
-    task, place = registry.find(str(file.task.get("name"))), label_files.found_in(path)
+    task = registry.resolve(own) if own else registry.find(str(file.task.get("name")))  # no file's code is loaded
+    place = label_files.found_in(path)
     assert place is not None  # the file was read before
     scalars = next((preset.config.scalars for preset in task.presets.values()), Scalars())
     rows = label_files.history(place)

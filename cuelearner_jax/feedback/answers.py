@@ -29,7 +29,8 @@ class AnswerForm(NamedTuple):
     answer: Callable[..., tuple[Array, Array]]
     values: Callable[[Space], tuple[float, ...]] | None = None  # allowed values of an entry; None: any finite number
     is_action: bool = False  # True if an answer is itself an action
-    by_eps: bool = False  # True if an answer means a change by eps, which label files then record
+    # True if an answer means a change by eps, which label files then record; 2 then means that nothing was said
+    by_eps: bool = False
     # (space, action, answer, eps) -> the action that the answer asks for; None: an answer names none
     correct: Callable[[Space, Array, Array, Array], Array] | None = None
     # (key, space, action, scalars) -> the second action of a question about a pair; None: questions show one action.

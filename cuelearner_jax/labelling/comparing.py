@@ -88,9 +88,9 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     """Concatenate the labels of several files; return the merged file and the number of duplicates left out.
 
     A label is a duplicate if an earlier file has a label of equal observation, action and answer, and of equal person
-    and time where all files record them. Raises UserError if the files differ in task, world, form or strength.
+    and time where both files record them. Raises UserError if the files differ in task, world, form or strength.
     """
-    files, earlier, fresh = list(files), set(), []
+    files, earlier, nameless, fresh = list(files), set(), set(), []
     first, everyone = files[0], all(file.people is not None for file in files)
     for file in files:
         if len(np.unique(file.seeds)) > 1:
@@ -100,10 +100,11 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
                 raise UserError(f"the files differ in {name} ({own}, {other}): merge only files that agree in it")
         if file.labels.obs.shape[1] != first.labels.obs.shape[1]:
             raise UserError("the files' observations differ in size: merge files of one world")
-        people = (file.people.who.tolist(), file.people.when.tolist()) if everyone and file.people else ()
+        people = (file.people.who.tolist(), file.people.when.tolist()) if file.people else ()
         keys = list(zip(_questions(file), map(bytes, np.asarray(file.labels.answer)), *people, strict=True))
-        fresh += [key not in earlier for key in keys]
-        earlier.update(keys)
+        fresh += [key not in earlier and key[:2] not in nameless for key in keys]
+        earlier.update(keys, (key[:2] for key in keys))
+        nameless.update(() if people else keys)
     mask = np.array(fresh, bool)
     labels = jax.tree.map(lambda *leaves: np.concatenate(leaves)[mask], *(file.labels for file in files))
     people = None

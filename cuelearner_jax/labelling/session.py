@@ -55,10 +55,12 @@ class Record:
         self._plan, self._writer = plan, label_files.LabelWriter(folder, *about, **more)
         self.path, self.trouble = self._writer.path, ""
         self.rows: dict[int, Response] = {}
+        self.seconds = 0.0  # that all answers took, also those taken back
         for row in label_files.history(self.path):
             obs, action = (np.asarray(row[name], np.float32) for name in ("obs", "action"))
             answer = None if row.get("answer") is None else np.asarray(row["answer"], np.float32)
             self.rows[row.get("item", -1)] = Response(row["said"], obs, action, answer, row["seconds"])
+            self.seconds += row["seconds"]
         if set(self.rows) != set(range(len(self.rows))):
             raise UserError(f"{self.path} was not written by the labelling page: give another --out")
 
@@ -74,6 +76,7 @@ class Record:
             raise UserError(self.trouble) from error
         self.trouble = ""
         self.rows[item.number] = response
+        self.seconds += seconds
 
     def in_order(self) -> list[Response]:
         """Return the responses by the numbers of their items; may be called from any thread."""
@@ -284,9 +287,8 @@ class Session(AbstractContextManager[Any, None]):
         count, pace = self.record.count(ANSWERED), self.record.per_minute()
         counts = count, self.record.count(UNSURE), self.plan.labels
         minutes = (self.plan.labels - count) / pace if pace else None
-        seconds = sum(row.seconds for row in self.record.in_order())
         due, newest = self._learner.is_due(count), self._learner.newest
-        return Status(*counts, pace, minutes, due, newest, self.record.trouble, seconds)
+        return Status(*counts, pace, minutes, due, newest, self.record.trouble, self.record.seconds)
 
     def listen(self, listener: Callable[[], object]) -> Callable[[], None]:
         """Register a function that is called, from any thread, when a new model is in use.

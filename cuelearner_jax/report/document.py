@@ -46,8 +46,8 @@ class ReportRequest(Question):
     split: str = "validation"
     """Evaluation episodes to report: validation or tuning."""
     lower_is_better: bool = False
-    """Smaller values of the metric are better, also where neither the runs' task says so nor its name (as collision,
-    cost, distance, error, foul, timeout)."""
+    """Smaller values of the metric are better, also where the runs' task does not say so (unless it names its own, of
+    collision, cost, distance, error, foul and timeout)."""
     by_run: bool = False
     """Report each folder separately, under its name, for runs of different configurations. Each is compared with its
     own unguided agents or, without any, with those of the first folder that has some."""

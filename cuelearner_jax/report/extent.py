@@ -39,9 +39,9 @@ def _plan_above(folder: str) -> Path | None:
 
 
 def less_is_better(plans: Plans) -> set[str]:
-    """Return the metrics of which less is better, by the runs' tasks or by default."""
-    own = [plan.get("less_is_better", ()) for plan in plans.values() if isinstance(plan, dict)]
-    return {*Task.less_is_better}.union(*own)
+    """Return the metrics of which less is better: by the runs' tasks, or by default where none says so."""
+    own = [plan["less_is_better"] for plan in plans.values() if isinstance(plan, dict) and "less_is_better" in plan]
+    return set().union(*(own or [Task.less_is_better]))
 
 
 def missing(every: Plans, table: pa.Table, split: str) -> list[str]:

@@ -80,7 +80,7 @@ class LabelFile(NamedTuple):
     labels: Label  # rows (labels, ...) that still count, in the order they were given
     people: People | None = None  # None: the labels of a simulated teacher, or a merge that includes such labels
     session: dict[str, Any] | None = None  # settings of the page that asked, see `labelling.session`
-    counts: dict[str, int] | None = None  # number of rows of each kind in `RESPONSES`, all rows counted
+    counts: dict[str, float] | None = None  # of all rows: number of each kind in `RESPONSES`, and their "seconds"
 
     @property
     def budget(self) -> int:
@@ -173,7 +173,9 @@ def read(path: Path) -> LabelFile:
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
     table, head = _table_and_head(file)
     try:
-        counts = dict(Counter(table["said"].to_pylist())) if "item" in table.column_names else None
+        counts: Any = dict(Counter(table["said"].to_pylist())) if "item" in table.column_names else None
+        if counts:
+            counts["seconds"] = sum(filter(None, table["seconds"].to_pylist()))
         table = _standing(table) if counts else table
         if head is None or not table.num_rows:
             raise UserError(f"{file} holds no labels: collect some first")

@@ -1,5 +1,6 @@
 """`cuelearner label` and `cuelearner labels`: the real command, what it refuses, and what takes its files."""
 
+import dataclasses
 import shlex
 import signal
 import socket
@@ -8,6 +9,7 @@ import urllib.error
 import urllib.request
 from pathlib import Path
 
+import probes
 import pytest
 import recorded_situations as recorded
 from sessions import OWN, expert, plan, served
@@ -124,6 +126,15 @@ def test_what_is_labelled_by_default_trains_in_minutes(monkeypatch, tmp_path, ca
     told = capsys.readouterr().out
     assert "done: 40 of 50 labels are saved" in told
     assert f"next: {following}" in told
+
+
+def test_a_second_opinion_is_asked_as_the_first_was(monkeypatch, tmp_path):
+    pytest.importorskip("nicegui")
+    weaker = dataclasses.replace(probes.CONFIG, scalars=dataclasses.replace(probes.SCALARS, eps_deg=7.0))
+    with Session(plan(config=weaker), tmp_path / "one") as session:
+        session.answer(0, expert(session.item))
+    asked, second, _ = asked_for(monkeypatch, OWN, "--again", str(tmp_path / "one"), "--out", str(tmp_path / "two"))
+    assert (asked.scalars.eps_deg, second.eps, len(second.again)) == (7.0, 7.0, 1)
 
 
 def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp_path):

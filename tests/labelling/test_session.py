@@ -101,7 +101,7 @@ def test_not_knowing_counts_for_nothing_and_an_answer_can_be_taken_back(opened, 
     assert file.people.item.tolist() == [0, 1, 2]
     assert file.labels.answer[2, 0] == 1.0
     assert file.labels.answer[1, 0] != expert(again)[0]
-    assert file.counts == {"answer": 4, "unsure": 1, "undone": 2}
+    assert {**file.counts, "seconds": 0} == {"answer": 4, "unsure": 1, "undone": 2, "seconds": 0}
     first = opened("first")
     assert not first.undo(0)
     assert lines(tmp_path / "first") == 0
@@ -224,6 +224,7 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
     assert (len(again.seeds), left_out) == (16, 16)
     nobodys = [one._replace(people=None) for one in (file, merged)]
     assert [comparing.merge([one, file])[1] for one in nobodys] == [8, 8]
+    assert comparing.merge([file, theirs, nobodys[0]])[1] == 8  # of people who agree both count
     narrower = file._replace(labels=file.labels.replace(obs=np.asarray(file.labels.obs)[:, :-1]))
     with pytest.raises(UserError, match="observations differ in size"):
         comparing.merge([file, narrower])

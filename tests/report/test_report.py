@@ -84,10 +84,20 @@ def test_nothing_is_overwritten_unasked_and_stale_figures_go(runs, tmp_path):
     assert (out / "notes.txt").read_text() == "mine"
 
 
-@pytest.mark.parametrize("metric", ["collision", "duration"])  # by any task, by the run's own
-def test_of_some_metrics_the_least_is_best(metric, tmp_path):
+DURATION = {"less_is_better": ["duration"]}
+
+
+@pytest.mark.parametrize(
+    ("metric", "own", "best"),
+    [
+        ("collision", {}, (0.3, 10, "8")),  # by default
+        ("duration", DURATION, (0.3, 10, "8")),
+        ("collision", DURATION, (0.8, 0, "never")),  # a task that names its own leaves no default
+    ],
+)
+def test_of_some_metrics_the_least_is_best(metric, own, best, tmp_path):
     (tmp_path / "runs").mkdir()
-    planned(tmp_path / "runs", less_is_better=["duration"])
+    planned(tmp_path / "runs", **own)
     for kind, values in (("none", (0.8, 0.5, 0.4)), ("heuristic", (0.8, 0.3, 0.35))):
         constants = {"run": kind, "task": "hall", "guidance": kind, "config_hash": "0f", "labels": 0}
         with TableWriter(tmp_path / "runs" / kind, results.SCHEMA, constants) as writer:
@@ -95,7 +105,7 @@ def test_of_some_metrics_the_least_is_best(metric, tmp_path):
                 writer.append(step=step, split="validation", seed=[0, 1], **{metric: [value, value]})
     report([tmp_path / "runs"], tmp_path / "out", ReportRequest(metric=metric))
     row = summary(tmp_path / "out")["heuristic", 0]
-    assert (float(row["best"]), int(row["best_step"]), row["reaches_unguided_final"]) == (0.3, 10, "8")
+    assert (float(row["best"]), int(row["best_step"]), row["reaches_unguided_final"]) == best
 
 
 def test_says_what_is_missing(runs, tmp_path):

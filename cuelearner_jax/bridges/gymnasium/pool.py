@@ -185,7 +185,8 @@ def close_all() -> None:
 
 def main(descriptor: int) -> None:
     """Serve instances until the pool closes its end, or its process is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles an interrupt, and then ends this process
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # the parent handles them, and ends this process
+        signal.signal(number, signal.SIG_IGN)
     link, instances, fault = Connection(descriptor), None, ""
     with contextlib.suppress(EOFError, OSError):
         sys.path[:] = link.recv()
