@@ -78,7 +78,8 @@ def test_processes_give_the_numbers_of_one_and_end_when_they_are_closed(monkeypa
     begun = pids(there)
     assert len(begun) == 2
     assert all(map(is_alive, begun))
-    os.kill(begun[0], signal.SIGINT)  # an interrupt is for who waits
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # each is for who waits
+        os.kill(begun[0], number)
     roll(there)
     assert pids(there) == begun
     # A process that is killed is told, and its place is taken by a new one.
