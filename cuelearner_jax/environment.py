@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS, Space
-from cuelearner_jax.types import EnvState, Step
+from cuelearner_jax.types import Action, EnvState, Observation, Step
 
 OWN, PROPOSED, EFFECT = "own", "proposed", "effect"
 KINDS = ("", OWN, PROPOSED, EFFECT, "beams", "directions")
@@ -95,25 +95,25 @@ class Environment(Protocol):
         """Number of entries of an observation: the sum of its slices."""
         ...
 
-    def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Float[Array, " obs"]]:
+    def reset(self, key: PRNGKeyArray) -> tuple[EnvState, Observation]:
         """Start an episode."""
         ...
 
-    def step(self, key: PRNGKeyArray, state: EnvState, action: Float[Array, " action"]) -> tuple[EnvState, Step]:
+    def step(self, key: PRNGKeyArray, state: EnvState, action: Action) -> tuple[EnvState, Step]:
         """Execute an action; reset automatically when the episode ends."""
         ...
 
-    def remember(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " memory"]:
+    def remember(self, state: EnvState, obs: Observation) -> Float[Array, " memory"]:
         """Return what replay stores of an observation: as little as `recall` needs."""
         ...
 
-    def recall(self, memory: Float[Array, " memory"]) -> Float[Array, " obs"]:
+    def recall(self, memory: Float[Array, " memory"]) -> Observation:
         """Return the observation that was acted on."""
         ...
 
     def recall_next(
-        self, memory: Float[Array, " memory"], action: Float[Array, " action"], aftermath: Float[Array, " aftermath"]
-    ) -> Float[Array, " obs"]:
+        self, memory: Float[Array, " memory"], action: Action, aftermath: Float[Array, " aftermath"]
+    ) -> Observation:
         """Return `Step.final_obs` of the step that `action` led to."""
         ...
 
@@ -147,17 +147,15 @@ class WholeObservations(Described):
     `Step.aftermath` is then `Step.final_obs`.
     """
 
-    def remember(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " obs"]:
+    def remember(self, state: EnvState, obs: Observation) -> Observation:
         """Return the observation."""
         return obs
 
-    def recall(self, memory: Float[Array, " obs"]) -> Float[Array, " obs"]:
+    def recall(self, memory: Observation) -> Observation:
         """Return the observation."""
         return memory
 
-    def recall_next(
-        self, memory: Float[Array, " obs"], action: Float[Array, " action"], aftermath: Float[Array, " obs"]
-    ) -> Float[Array, " obs"]:
+    def recall_next(self, memory: Observation, action: Action, aftermath: Observation) -> Observation:
         """Return the next observation."""
         return aftermath
 

@@ -16,6 +16,8 @@ Params = Any  # a Flax parameter pytree
 EnvState = Any  # the pytree that an environment carries from step to step
 Observation = Float[Array, " obs"]
 Action = Float[Array, " action"]
+Observations = Float[Array, "n obs"]
+Actions = Float[Array, "n action"]
 Number = Float[Array, ""] | float
 
 

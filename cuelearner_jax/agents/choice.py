@@ -10,13 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cuelearner_jax.devices import portions
+from cuelearner_jax.types import Action, Actions, Observation, Observations
 
 ChoiceT = TypeVar("ChoiceT", bound=Any)  # an action, or a record of actions
 
 
-def best_of(
-    value: Callable[[Array, Array], Array], options: Float[Array, "m action"], obs: Float[Array, "n obs"]
-) -> Float[Array, "n action"]:
+def best_of(value: Callable[[Array, Array], Array], options: Float[Array, "m action"], obs: Observations) -> Actions:
     """Return the best action of a set in each situation, computing one portion of the situations at a time.
 
     `value`: (observation (obs,), actions (m, action)) -> values (m,).
@@ -28,10 +27,10 @@ def best_near_peaks(
     value: Callable[[Array, Array], Array],
     rough: Callable[[Array, Array], Array],
     options: Float[Array, "m action"],
-    obs: Float[Array, "n obs"],
+    obs: Observations,
     coarse: int,
     peaks: int,
-) -> Float[Array, "n action"]:
+) -> Actions:
     """Return the choice of `best_of`, if the largest value lies next to a high peak of a coarse first look.
 
     The `options` are evenly spaced, the last beside the first. `rough` approximates `value` for the first look, at
@@ -39,7 +38,7 @@ def best_near_peaks(
     """
     stride = len(options) // coarse
 
-    def choose(one: Float[Array, " obs"]) -> Float[Array, " action"]:
+    def choose(one: Observation) -> Action:
         first = rough(one, options[::stride])
         summit = (first >= jnp.roll(first, 1)) & (first >= jnp.roll(first, -1))
         _, highest = jax.lax.top_k(jnp.where(summit, first, -jnp.inf), peaks)
@@ -49,6 +48,6 @@ def best_near_peaks(
     return each_in_portions(choose, obs, coarse + peaks * (2 * stride - 1))
 
 
-def each_in_portions(choose: Callable[[Array], ChoiceT], obs: Float[Array, "n obs"], looked: int) -> ChoiceT:
+def each_in_portions(choose: Callable[[Array], ChoiceT], obs: Observations, looked: int) -> ChoiceT:
     """Return a choice in each situation (leading axis n), with as many situations at once as memory allows."""
     return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // looked)))

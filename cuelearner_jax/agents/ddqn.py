@@ -23,7 +23,7 @@ from cuelearner_jax.config import POSITIVE, SHARE, TRACED, Bounds, Frame, Layers
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import DIRECTIONS
-from cuelearner_jax.types import Params
+from cuelearner_jax.types import Actions, Number, Observations, Params
 
 ALIGNED = 64  # layers computed in bfloat16 are filled up to multiples: 20% faster on an H200, whose rows want alignment
 
@@ -116,7 +116,7 @@ class DoubleDQN:
         copy = jax.tree.map(jnp.copy, params) if self.bootstraps else None
         return params, DDQNState(copy, optimizer(self.options.optimizer, 0.0, 0.0).init(params))
 
-    def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
+    def act(self, env: Any, params: Params, obs: Observations, key: PRNGKeyArray) -> Actions:
         """Return the action of the whole set with the largest value.
 
         The rough first look (`coarse_directions`) is for play while learning alone: where values are sharp it misses
@@ -124,18 +124,14 @@ class DoubleDQN:
         """
         return best_of(partial(self.value, env, params), self._directions, obs)
 
-    def explore(
-        self, env: Any, options: DDQNConfig, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
-    ) -> Float[Array, "n action"]:
+    def explore(self, env: Any, options: DDQNConfig, params: Params, obs: Observations, key: PRNGKeyArray) -> Actions:
         """Return the greedy action, searched near peaks where the options say so, or one of the set by chance."""
         k_explore, k_choice = jax.random.split(key)
         by_chance = jax.random.choice(k_choice, self._directions, (len(obs),))
         explores = jax.random.bernoulli(k_explore, options.exploration, (len(obs), 1))
         return jnp.where(explores, by_chance, self._greedy(env, params, obs, key))
 
-    def _greedy(
-        self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
-    ) -> Float[Array, "n action"]:
+    def _greedy(self, env: Any, params: Params, obs: Observations, key: PRNGKeyArray) -> Actions:
         own = self.options
         if not own.coarse_directions:
             return self.act(env, params, obs, key)
@@ -195,7 +191,7 @@ class DoubleDQN:
         self,
         env: Any,
         options: DDQNConfig,
-        discount: Float[Array, ""] | float,
+        discount: Number,
         params: Params,
         target_params: Params,
         batches: list[Transition],
@@ -221,9 +217,7 @@ class DoubleDQN:
         return self.spaces.actions.spread(self.options.directions)
 
 
-def target(
-    reward: Float[Array, ""], discount: Float[Array, ""] | float, next_value: Float[Array, ""]
-) -> Float[Array, ""]:
+def target(reward: Float[Array, ""], discount: Number, next_value: Float[Array, ""]) -> Float[Array, ""]:
     """Return r + discount * Q'(s', argmax_a Q(s', a)); `discount` is 0 after a termination."""
     chex.assert_rank([reward, discount, next_value], 0)
     return reward + discount * next_value
@@ -235,9 +229,7 @@ def loss(values: Float[Array, " batch"], targets: Float[Array, " batch"]) -> Flo
     return jnp.mean(jnp.square(values - targets))
 
 
-def optimizer(
-    name: Literal["sgd", "adam"], learning_rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float
-) -> optax.GradientTransformation:
+def optimizer(name: Literal["sgd", "adam"], learning_rate: Number, max_norm: Number) -> optax.GradientTransformation:
     """Return SGD or Adam after clipping gradients to a global norm. Both scalars may be traced."""
     maker = {"sgd": optax.sgd, "adam": optax.adam}[name]
     return optax.chain(optax.clip_by_global_norm(max_norm), maker(learning_rate))

@@ -16,7 +16,7 @@ from cuelearner_jax.agents import ddqn, sac
 from cuelearner_jax.agents.replay import Memory
 from cuelearner_jax.config import Frame, Scalars, Sizes
 from cuelearner_jax.environment import Spaces
-from cuelearner_jax.types import Params
+from cuelearner_jax.types import Actions, Observations, Params
 
 
 @runtime_checkable
@@ -37,13 +37,11 @@ class AgentFunctions(Protocol):
         """Return parameters that act, and the rest of the learning state."""
         ...
 
-    def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
+    def act(self, env: Any, params: Params, obs: Observations, key: PRNGKeyArray) -> Actions:
         """Return actions of the finished agent. `env` gives the features of observations (`Sizes.frame`)."""
         ...
 
-    def explore(
-        self, env: Any, options: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
-    ) -> Float[Array, "n action"]:
+    def explore(self, env: Any, options: Any, params: Params, obs: Observations, key: PRNGKeyArray) -> Actions:
         """Return actions during learning; `options`: see `update`."""
         ...
 

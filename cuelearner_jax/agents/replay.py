@@ -17,14 +17,14 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Num, PRNGKeyArray
 
 from cuelearner_jax.environment import Environment, actions_of, random_symmetries
-from cuelearner_jax.types import Step
+from cuelearner_jax.types import Action, Number, Observation, Step
 
 
 class StoredStep(struct.PyTreeNode):
     """One step in replay, as small as the environment can make it."""
 
     obs: Float[Array, " memory"]  # see `Environment.remember`
-    action: Float[Array, " action"]  # as executed
+    action: Action  # as executed
     reward: Float[Array, ""]
     discount: Float[Array, " 1_or_0"]  # this and the next two have no entries where nothing bootstraps
     ended: Float[Array, " 1_or_0"]  # 1 where the episode ended, terminated or truncated
@@ -34,8 +34,8 @@ class StoredStep(struct.PyTreeNode):
 class Transition(struct.PyTreeNode):
     """One step to learn from. `next_obs` has no entries where nothing bootstraps from it (discount 0)."""
 
-    obs: Float[Array, " obs"]
-    action: Float[Array, " action"]  # as executed
+    obs: Observation
+    action: Action  # as executed
     reward: Float[Array, ""]
     # discount of the value of `next_obs`: 0 at termination, never at truncation; 1 after one step
     discount: Float[Array, ""]
@@ -133,8 +133,8 @@ class Memory(NamedTuple):
         key: PRNGKeyArray,
         size: int,
         n_step: int = 1,
-        discount: Float[Array, ""] | float = 0.0,
-        guided_share: Float[Array, ""] | float | None = None,
+        discount: Number = 0.0,
+        guided_share: Number | None = None,
     ) -> list[Transition]:
         """Draw transitions (size,), each under a random symmetry of the environment.
 
@@ -183,7 +183,7 @@ class Memory(NamedTuple):
             next_obs, discount = jnp.zeros((stored.reward.shape[0], 0)), jnp.zeros_like(stored.reward)
         return Transition(jax.vmap(self.env.recall)(stored.obs), stored.action, stored.reward, discount, next_obs)
 
-    def n_step(self, numbers: Int[Array, " batch"], n: int, discount: Float[Array, ""] | float) -> Transition:
+    def n_step(self, numbers: Int[Array, " batch"], n: int, discount: Number) -> Transition:
         """Return the transitions that begin at rows `numbers` and span up to n steps of one episode."""
         after = self.buffer.follow(self.rows, self.filled, numbers, n, self.num_envs)
         summed = jax.vmap(partial(n_step_return, discount=discount))
@@ -242,7 +242,7 @@ def n_step_return(
     discounts: Float[Array, " n"],
     ended: Float[Array, " n"],
     exists: Bool[Array, " n"],
-    discount: Float[Array, ""] | float,
+    discount: Number,
 ) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
     """Return the discounted rewards of up to n steps of one episode (Sutton and Barto, 2018, Eq. 7.1).
 
@@ -270,9 +270,7 @@ def buffer_for(env: Environment, bootstraps: bool) -> RingBuffer:
     return RingBuffer(jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes))
 
 
-def stored_step(
-    obs: Float[Array, " memory"], action: Float[Array, " action"], step: Step, bootstraps: bool
-) -> StoredStep:
+def stored_step(obs: Float[Array, " memory"], action: Action, step: Step, bootstraps: bool) -> StoredStep:
     """Return what replay stores of one step from the remembered observation `obs`."""
     entries = slice(None) if bootstraps else slice(0)
     ended: Bool[Array, ""] = step.terminated | step.truncated

@@ -31,7 +31,7 @@ from cuelearner_jax.config import POSITIVE, SHARE, Bounds, Frame, Layers, Scalar
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Box
-from cuelearner_jax.types import Params
+from cuelearner_jax.types import Actions, Number, Observations, Params
 
 LOG_STD = (-20.0, 2.0)  # bounds of the logarithm of the Gaussian's standard deviation
 
@@ -122,7 +122,7 @@ class Actor(nn.Module):
 class ActionSample(NamedTuple):
     """Actions drawn from the squashed Gaussian."""
 
-    unit: Float[Array, "n action"]  # in unit coordinates
+    unit: Actions  # in unit coordinates
     log_density: Float[Array, " n"]  # in unit coordinates
 
 
@@ -164,13 +164,11 @@ class SoftActorCritic:
             params["obs"] = {"mean": obs, "variance": jnp.ones_like(obs)}
         return params, SACState(copy, log_temperature, *opt_states)
 
-    def act(self, env: Any, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> Float[Array, "n action"]:
+    def act(self, env: Any, params: Params, obs: Observations, key: PRNGKeyArray) -> Actions:
         """Return the squashed mean of the Gaussian."""
         return self.in_box(jnp.tanh(self._gaussian(params["actor"], normalised(obs, params.get("obs")))[0]))
 
-    def explore(
-        self, env: Any, options: SACConfig, params: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray
-    ) -> Float[Array, "n action"]:
+    def explore(self, env: Any, options: SACConfig, params: Params, obs: Observations, key: PRNGKeyArray) -> Actions:
         """Return actions drawn from the squashed Gaussian."""
         return self.in_box(self.draw(params["actor"], normalised(obs, params.get("obs")), key).unit)
 
@@ -182,7 +180,7 @@ class SoftActorCritic:
         """Return actions in unit coordinates as actions of the box."""
         return self.spaces.actions.exp(self._box.middle(), unit / 2)
 
-    def draw(self, actor: Params, obs: Float[Array, "n obs"], key: PRNGKeyArray) -> ActionSample:
+    def draw(self, actor: Params, obs: Observations, key: PRNGKeyArray) -> ActionSample:
         """Draw actions from the squashed Gaussian, with their log-densities; both have gradients."""
         mean, log_std = self._gaussian(actor, obs)
         noise = jax.random.normal(key, mean.shape)
@@ -264,10 +262,10 @@ class SoftActorCritic:
 
     def targets(
         self,
-        discount: Float[Array, ""] | float,
+        discount: Number,
         actor: Params,
         target_critics: Params,
-        temperature: Float[Array, ""] | float,
+        temperature: Number,
         batch: Transition,
         key: PRNGKeyArray,
     ) -> Float[Array, " batch"]:
@@ -330,7 +328,7 @@ class SoftActorCritic:
         subset = jax.random.permutation(key, own.critics)[: own.target_critics]
         return jax.tree.map(lambda leaf: leaf[subset], target_critics)
 
-    def _gaussian(self, actor: Params, obs: Float[Array, "n obs"]) -> tuple[Array, Array]:
+    def _gaussian(self, actor: Params, obs: Observations) -> tuple[Array, Array]:
         mean, log_std = self._actor.apply(actor, obs)
         return jnp.asarray(mean), jnp.asarray(log_std)
 
@@ -363,9 +361,7 @@ def squashed_log_density(
     return jnp.sum(normal - squashed, -1)
 
 
-def optimizer_step(
-    rate: Float[Array, ""] | float, max_norm: Float[Array, ""] | float, gradient: Any, opt_state: Any, params: Any
-) -> tuple[Any, Any]:
+def optimizer_step(rate: Number, max_norm: Number, gradient: Any, opt_state: Any, params: Any) -> tuple[Any, Any]:
     """Return parameters and Adam's state after a step whose gradient is clipped to a norm."""
     change, opt_state = optimizer("adam", rate, max_norm).update(gradient, opt_state, params)
     return optax.apply_updates(params, change), opt_state

@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, WholeObservations
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Box, Cue, Space, box
-from cuelearner_jax.types import Step
+from cuelearner_jax.types import Action, Observation, Step
 
 PRIVILEGED = "privileged_state"  # Playground's entry of an observation for critics
-Heuristic = Callable[[Float[Array, " obs"]], Float[Array, " action"]]
+Heuristic = Callable[[Observation], Action]
 
 
 class SimulatorState(struct.PyTreeNode):
@@ -46,14 +46,12 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
     actions: Space = struct.field(pytree_node=False)
     heuristic: Heuristic | None = struct.field(pytree_node=False, default=None)
 
-    def reset(self, key: PRNGKeyArray) -> tuple[SimulatorState, Float[Array, " obs"]]:
+    def reset(self, key: PRNGKeyArray) -> tuple[SimulatorState, Observation]:
         """Start an episode."""
         state = jax.tree.map(jnp.asarray, self.simulator().reset(jax.random.key_data(key)))
         return SimulatorState(state, jnp.zeros((), jnp.int32)), flat(state.obs)
 
-    def step(
-        self, key: PRNGKeyArray, state: SimulatorState, action: Float[Array, " action"]
-    ) -> tuple[SimulatorState, Step]:
+    def step(self, key: PRNGKeyArray, state: SimulatorState, action: Action) -> tuple[SimulatorState, Step]:
         """Step the simulator, then reset it if that was the end. `key` is the reset's: simulators' steps take none."""
         before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into their input dictionaries
         after = SimulatorState(jax.tree.map(jnp.asarray, self.simulator().step(before, action)), state.steps + 1)
@@ -105,7 +103,7 @@ def layout_of(simulator: Any, name: str) -> Interface:
     return Interface(observation, _entries_of(simulator, int(simulator.action_size)))
 
 
-def flat(obs: Array | Mapping[str, Any]) -> Float[Array, " obs"]:
+def flat(obs: Array | Mapping[str, Any]) -> Observation:
     """Return an observation as one vector; the slices of a dictionary stand in the order of their names."""
     leaves = [jnp.ravel(leaf).astype(jnp.float32) for leaf in jax.tree.leaves(_without_privileged(obs))]
     return leaves[0] if len(leaves) == 1 else jnp.concatenate(leaves)

@@ -21,10 +21,8 @@ from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
 from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, silent_cues, squared_errors
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.spaces import is_answered
-from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
+from cuelearner_jax.types import Action, Actions, GuidanceModel, Label, Observation, Observations, Params
 
-Observations = Float[Array, "n obs"]
-Actions = Float[Array, "n action"]
 Rows = Bool[Array, " n"]  # which rows
 
 REFERENCES = 16  # actions over which the mean of an output is taken that labels do not tell

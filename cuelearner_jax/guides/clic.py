@@ -37,11 +37,11 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cuelearner_jax.agents.choice import each_in_portions
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION, RELATIVE
-from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
+from cuelearner_jax.guides.base import Guide, Rows, replaced
 from cuelearner_jax.guides.fitting import silent_cues
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Box, is_answered, says_something
-from cuelearner_jax.types import Action, GuidanceModel, Label, Observation, Params
+from cuelearner_jax.types import Action, Actions, GuidanceModel, Label, Observation, Observations, Params
 
 SHARPNESS = 10.0  # weight of the observation model against the policy
 SOFTNESS = 0.5  # softness of a set's edge, in units of eps: 0.1 in actions from -1 to 1, where eps is 0.2

@@ -32,11 +32,11 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Actions, Observations, Rows
+from cuelearner_jax.guides.base import Rows
 from cuelearner_jax.guides.demonstration import Demonstration
 from cuelearner_jax.guides.fitting import Example, for_each, optimizer, squared_errors, with_moments
 from cuelearner_jax.guides.refining import Refinement
-from cuelearner_jax.types import GuidanceModel, Label, Params
+from cuelearner_jax.types import Actions, GuidanceModel, Label, Observations, Params
 
 REPLAY_STEPS = 5  # gradient steps on earlier corrections after each new one
 CORRECTION_REPLAY = 50  # newest corrections that the policy keeps learning from

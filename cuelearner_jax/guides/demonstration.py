@@ -21,10 +21,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import DEMONSTRATION
-from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows
+from cuelearner_jax.guides.base import Guide, Rows
 from cuelearner_jax.guides.fitting import Example
 from cuelearner_jax.guides.refining import Refinement
-from cuelearner_jax.types import GuidanceModel, Params
+from cuelearner_jax.types import Actions, GuidanceModel, Observations, Params
 
 
 class Demonstration(Guide):

@@ -26,11 +26,11 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cuelearner_jax.config import Bounds, GuideScalars, Layers, part
 from cuelearner_jax.environment import Aims
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows
+from cuelearner_jax.guides.base import Guide, Rows
 from cuelearner_jax.guides.fitting import GuideModel, ensemble, fit_model
 from cuelearner_jax.guides.refining import Refinement
 from cuelearner_jax.spaces import Space, is_answered
-from cuelearner_jax.types import Action, GuidanceModel, Label, Params
+from cuelearner_jax.types import Action, Actions, GuidanceModel, Label, Observations, Params
 
 ELSEWHERE = 360  # evenly spaced actions that stand for "the teacher means none of the aims"
 SPREAD = 1 / 180  # distance of a meant action from its aim, as a share of the space's reach

@@ -17,10 +17,10 @@ from typing import Any
 
 from cuelearner_jax.config import GuideScalars
 from cuelearner_jax.feedback.answers import RELATIVE
-from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows
+from cuelearner_jax.guides.base import Guide, Rows
 from cuelearner_jax.guides.fitting import Example
 from cuelearner_jax.guides.refining import Refinement
-from cuelearner_jax.types import Action, GuidanceModel, Label
+from cuelearner_jax.types import Action, Actions, GuidanceModel, Label, Observations
 
 
 class Relative(Guide):

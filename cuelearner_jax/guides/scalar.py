@@ -23,9 +23,9 @@ from jaxtyping import PRNGKeyArray
 from cuelearner_jax.agents.choice import best_of
 from cuelearner_jax.config import POSITIVE, SHARE, GuideScalars, part
 from cuelearner_jax.feedback.answers import SCALAR
-from cuelearner_jax.guides.base import Actions, Guide, Observations, Rows, replaced
+from cuelearner_jax.guides.base import Guide, Rows, replaced
 from cuelearner_jax.guides.refining import Refinement
-from cuelearner_jax.types import Action, GuidanceModel, Observation
+from cuelearner_jax.types import Action, Actions, GuidanceModel, Observation, Observations
 
 
 @part

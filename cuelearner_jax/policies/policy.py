@@ -23,7 +23,7 @@ from cuelearner_jax.guides.base import Guide
 from cuelearner_jax.guides.refining import refine
 from cuelearner_jax.run_config import kind_to_json, part_to_json
 from cuelearner_jax.spaces import DIRECTIONS, Box, Space
-from cuelearner_jax.types import EnvState, GuidanceModel, Params, Policy, Teacher
+from cuelearner_jax.types import Actions, EnvState, GuidanceModel, Observations, Params, Policy, Teacher
 
 SHARED, BY_LANE = None, 0  # axis of a leaf: shared by all lanes, or one entry for each lane
 
@@ -35,7 +35,7 @@ class PolicyNode(struct.PyTreeNode):
     ASKS = False  # True if the policy asks a teacher
     LANES: ClassVar[tuple[str, ...]] = ()  # fields of a block with one entry for each lane
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Act as `types.Policy.act`."""
         raise NotImplementedError
 
@@ -102,9 +102,7 @@ def policy_name(policy: Any) -> str:
     return f"policy {code_name(policy)}"
 
 
-def call_policy(
-    policy: Policy, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Space
-) -> Float[Array, "n action"]:
+def call_policy(policy: Policy, key: PRNGKeyArray, states: EnvState, obs: Observations, actions: Space) -> Actions:
     """Return a policy's actions, NaN in place of each invalid one. Raises UserError for another shape."""
     result, shape = jnp.asarray(policy.act(key, states, obs)), (obs.shape[0], actions.size)
     if result.shape != shape:
@@ -129,7 +127,7 @@ class Agent(PolicyNode):
     functions: AgentFunctions = struct.field(pytree_node=False)
     view: Any = None  # provides `features`; the raw frame needs none
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return the finished agent's actions."""
         return self.functions.act(self.view, self.params, obs, key)
 
@@ -145,7 +143,7 @@ class Uniform(PolicyNode):
 
     actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return new uniform draws at each call (paper, Eq. 6)."""
         return self.actions.sample(key, (obs.shape[0],))
 
@@ -157,7 +155,7 @@ class Middle(PolicyNode):
 
     box: Box = struct.field(pytree_node=False)
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return the same action in every situation."""
         return jnp.broadcast_to(self.box.middle(), (len(obs), self.box.size))
 
@@ -168,7 +166,7 @@ class NearAims(PolicyNode):
     view: Any  # an environment or view with aims
     reach: Float[Array, ""] | float  # largest distance from the aim, in the unit of the space's `log`
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return new draws at each call."""
         return jax.vmap(self._one)(jax.random.split(key, len(obs)), obs)
 
@@ -193,7 +191,7 @@ class Taught(PolicyNode):
 
     teacher: Teacher
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return the teacher's best actions."""
         return best_actions(self.teacher, states, obs)
 
@@ -205,7 +203,7 @@ class Heuristic(PolicyNode):
 
     view: Any
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return the environment's heuristic actions."""
         return jax.vmap(self.view.heuristic)(obs)
 
@@ -222,7 +220,7 @@ class Guided(PolicyNode):
     # sizes of the guidance, needed to store it
     sizes: GuideSizes | None = struct.field(pytree_node=False, default=None)
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return the base's actions after guidance."""
         base = self.base.act(key, states, obs)
         where = (self.model, self.view, obs, base, jnp.ones(obs.shape[0], bool), self.scalars)
@@ -258,7 +256,7 @@ class Common(PolicyNode):
 
     policy: Any
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return the policy's actions."""
         return self.policy.act(key, states, obs)
 
@@ -282,7 +280,7 @@ class Corrected(PolicyNode):
     scalars: Scalars
     actions: Space = struct.field(pytree_node=False, default=DIRECTIONS)
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return the base's actions, corrected by the teacher's answers until the teacher calls them right."""
         space, first = self.actions, self.base.act(key, states, obs)
         eps = space.from_unit(self.scalars.eps_deg)
@@ -308,7 +306,7 @@ def _plain_part(kind: type, values: Any) -> dict[str, Any]:
     return {name: value for name, value in to_json(kind(**own)).items() if name in own}
 
 
-def best_actions(teacher: Teacher, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+def best_actions(teacher: Teacher, states: EnvState, obs: Observations) -> Actions:
     """Return a teacher's actions in n situations, a few at a time: a searching teacher simulates hundreds for each."""
     ask = lambda pair: teacher.best_action(*pair)  # noqa: E731
     return jax.lax.map(ask, (states, obs), batch_size=min(len(obs), portions().states))

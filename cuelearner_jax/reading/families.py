@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from cuelearner_jax.environment import EFFECT, PROPOSED, Quantity, actions_of
 from cuelearner_jax.errors import UserError
+from cuelearner_jax.types import Action, Observation
 
 AXES = ("x", "y", "z")
 SHIFTING = ("m", "rad")  # units of entries that a displaced sensor shifts by a constant
@@ -35,7 +36,7 @@ class Unknown(NamedTuple):
 
 
 Undoing = Callable[[Float[Array, " unknowns"], Float[Array, " size"]], Float[Array, " size"]]
-Planning = Callable[[Float[Array, " unknowns"], Float[Array, " obs"], Float[Array, " action"]], Float[Array, " action"]]
+Planning = Callable[[Float[Array, " unknowns"], Observation, Action], Action]
 
 
 class Distortion(NamedTuple):
@@ -58,18 +59,14 @@ def unknowns_of(family: Family) -> tuple[Unknown, ...]:
     return tuple(unknown for distortion in family for unknown in distortion.unknowns)
 
 
-def undo_observation(
-    family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"]
-) -> Float[Array, " obs"]:
+def undo_observation(family: Family, theta: Float[Array, " unknowns"], obs: Observation) -> Observation:
     """Return the observation as it would have been without the changes."""
     for distortion, values in _parts(family, theta):
         obs = obs if distortion.sees is None else distortion.sees(values, obs)
     return obs
 
 
-def undo_action(
-    family: Family, theta: Float[Array, " unknowns"], obs: Float[Array, " obs"], action: Float[Array, " action"]
-) -> Float[Array, " action"]:
+def undo_action(family: Family, theta: Float[Array, " unknowns"], obs: Observation, action: Action) -> Action:
     """Return the action that, after the changes, does what `action` did before them; `obs`: without the changes."""
     for distortion, values in _parts(family, theta):
         action = action if distortion.plans is None else distortion.plans(values, obs, action)

@@ -25,6 +25,7 @@ from cuelearner_jax.reading.linear import PARTS, SCALE, Acts, Change, Observatio
 from cuelearner_jax.reading.policy import Correction, corrected
 from cuelearner_jax.reading.posterior import TAU, Data, Hyper, ModelParts, Posterior
 from cuelearner_jax.spaces import Space
+from cuelearner_jax.types import Actions, Number, Observations
 
 ROUNDS = 3  # linearisations of each fit
 TRUST = 1.0  # largest step of a weight at one linearisation, in standard deviations of its prior's middle
@@ -99,7 +100,7 @@ class Reader:
     space: Space  # of the actions, with cues
     family: Family  # what the world declares or the user names; empty: any entry of the observation may shift
     acts: Acts  # the policy, NaN where it has no action; plain Python, or traced with everything else
-    eps: Float[Array, ""] | float  # strength of an answer, in the unit of `space.log`
+    eps: Number  # strength of an answer, in the unit of `space.log`
     # size of each unknown of the family that changes actions by a usual correction; None without a family
     step: Float[Array, " unknowns"] | None = None
     process: bool = True  # whether corrections may depend on the situation in ways that no parameter describes
@@ -159,9 +160,7 @@ class Reader:
         whole = self._probe(frame, change, labels.obs)
         return _data(self.space, self.family, frame, change, labels, own, whole, self.eps)
 
-    def _probe(
-        self, frame: ObservationFrame, changes: Change, obs: Float[Array, "n obs"]
-    ) -> Float[Array, "h k n action"]:
+    def _probe(self, frame: ObservationFrame, changes: Change, obs: Observations) -> Float[Array, "h k n action"]:
         """Return what actions at `linear.sides` of stacked estimates mean. The policy is asked in portions of sides."""
         sides, whole = _sides(frame, changes), []
         count = min(sides.shape[1], -(-sides.shape[0] * sides.shape[1] * obs.size // PORTION))
@@ -170,7 +169,7 @@ class Reader:
             whole.append(_meant_each(self.family, thetas, before, self._ask(before)))
         return jnp.concatenate(whole, 1)
 
-    def act(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, fitted: Fit, obs: Observations) -> Actions:
         """Return corrected actions by one fit."""
         before = linear.undone(self.family, fitted.hypothesis.change, obs)
         actions = self._ask(jnp.stack([obs, before]))
@@ -192,7 +191,7 @@ class Reader:
         best, nothing = (self.predict(pick(fits, number), labels)[2].sum() for number in (best_of(fits), 0))
         return jnp.logaddexp(best - nothing, 0.0) - math.log(2)
 
-    def spread(self, fitted: Fit, obs: Float[Array, "n obs"]) -> Float[Array, "n cues"]:
+    def spread(self, fitted: Fit, obs: Observations) -> Float[Array, "n cues"]:
         """Return the standard deviation of the right action along each cue, in the unit of `space.log`."""
         zeros = jnp.zeros((len(obs), len(self.space.cues)))
         labels = RelativeLabels(obs, self.act(fitted, obs), zeros, jnp.ones(len(obs), bool))

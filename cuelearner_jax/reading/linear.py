@@ -25,8 +25,9 @@ from cuelearner_jax.reading.families import Family, has_effects, undo_action, un
 from cuelearner_jax.reading.likelihood import Answers, intervals
 from cuelearner_jax.reading.posterior import TAU, Data
 from cuelearner_jax.spaces import DIRECTIONS, Space
+from cuelearner_jax.types import Actions, Number, Observations
 
-Acts = Callable[[Float[Array, "n obs"]], Float[Array, "n action"]]
+Acts = Callable[[Observations], Actions]
 SCALE = 3.0  # unit of changes of an action, in eps: the size of a usual correction
 STEP = 0.35  # of the central differences of an entry, in its standard deviations
 MIXED = 8  # largest number of entries that may mix, of the observation and of the action
@@ -60,8 +61,8 @@ class Change(struct.PyTreeNode):
 class RelativeLabels(NamedTuple):
     """Relative answers in arrays of a fixed size."""
 
-    obs: Float[Array, "n obs"]
-    action: Float[Array, "n action"]
+    obs: Observations
+    action: Actions
     answer: Float[Array, "n cues"]
     valid: Bool[Array, " n"]
 
@@ -92,16 +93,14 @@ def terms(cues: int, basis: int) -> Int[np.ndarray, "2 own"]:
 
 
 @partial(jax.jit, static_argnums=0)
-def undone(family: Family, change: Change, obs: Float[Array, "n obs"]) -> Float[Array, "n obs"]:
+def undone(family: Family, change: Change, obs: Observations) -> Observations:
     """Return observations as they would be without the change."""
     if family:
         return jax.vmap(partial(undo_observation, family, change.theta))(obs)
     return obs - change.theta[None] + (obs - change.centre[None]) @ change.mix.T
 
 
-def meant(
-    family: Family, theta: Float[Array, " unknowns"], before: Float[Array, "n obs"], action: Float[Array, "n action"]
-) -> Float[Array, "n action"]:
+def meant(family: Family, theta: Float[Array, " unknowns"], before: Observations, action: Actions) -> Actions:
     """Return what a policy's actions about undone observations `before` mean in the changed world."""
     return jax.vmap(partial(undo_action, family, theta))(before, action) if family else action
 
@@ -111,7 +110,7 @@ def basis_size(space: Space) -> int:
     return 5 if space == DIRECTIONS else 1 + space.size
 
 
-def basis(space: Space, action: Float[Array, "n action"]) -> Float[Array, "n basis"]:
+def basis(space: Space, action: Actions) -> Float[Array, "n basis"]:
     """Return 1 and the entries of actions, of the order of one; of directions also the second harmonics.
 
     A drift of the executed motion turns directions by a first harmonic, another gain along one axis by a second.
@@ -144,7 +143,7 @@ def frame_of(
 
 
 @partial(jax.jit, static_argnums=0)
-def jumps(space: Space, whole: Float[Array, "k n action"], eps: Float[Array, ""] | float) -> Bool[Array, "n unknowns"]:
+def jumps(space: Space, whole: Float[Array, "k n action"], eps: Number) -> Bool[Array, "n unknowns"]:
     """Return where the policy chooses something else, at a side of an unknown, or has no action at both.
 
     A policy that takes the best of far-apart actions does so near ties, where a slope says nothing. `whole`: what its
@@ -178,7 +177,7 @@ def data(
     frame: ObservationFrame,
     change: Change,
     labels: RelativeLabels,
-    own: Float[Array, "n action"],
+    own: Actions,
     whole: Float[Array, "k n action"],
     eps: Float[Array, ""],
 ) -> Data:
@@ -210,7 +209,7 @@ def features(
     space: Space,
     frame: ObservationFrame,
     slope: Float[Array, "n cues u"],
-    obs: Float[Array, "n obs"],
+    obs: Observations,
     base: Float[Array, "n a"],
 ) -> Float[Array, "n cues p"]:
     """Return the change of each cue by each weight."""
@@ -223,9 +222,7 @@ def features(
 
 
 @partial(jax.jit, static_argnums=0)
-def inputs(
-    space: Space, frame: ObservationFrame, obs: Float[Array, "n obs"], action: Float[Array, "n action"]
-) -> Float[Array, "n z"]:
+def inputs(space: Space, frame: ObservationFrame, obs: Observations, action: Actions) -> Float[Array, "n z"]:
     """Return what the process sees: the observation, and what the policy does about it."""
     z = jnp.clip((obs - frame.mean[None]) / frame.deviation[None], -LARGEST, LARGEST) * frame.varies[None]
     return jnp.concatenate([z, 2 * space.even(action)], 1)
@@ -253,9 +250,7 @@ def change_of(frame: ObservationFrame, weights: Float[Array, " p"], like: Change
     return Change(theta * frame.step, whole, frame.mean, action)
 
 
-def steps_of(
-    space: Space, family: Family, acts: Acts, obs: Float[Array, "n obs"], eps: float
-) -> Float[Array, " unknowns"]:
+def steps_of(space: Space, family: Family, acts: Acts, obs: Observations, eps: float) -> Float[Array, " unknowns"]:
     """Return the size of each unknown: its own scale, or the least that moves actions by `SCALE` eps.
 
     An unknown that moves no action so far has the size that moves actions by half of the most.

@@ -16,7 +16,7 @@ from cuelearner_jax.reading import linear, posterior
 from cuelearner_jax.reading.families import Family, has_effects, unknowns_of
 from cuelearner_jax.reading.linear import Change, ObservationFrame
 from cuelearner_jax.spaces import Space
-from cuelearner_jax.types import EnvState
+from cuelearner_jax.types import Actions, EnvState, Observations
 
 KIND = "reading"
 
@@ -31,7 +31,7 @@ class Correction(struct.PyTreeNode):
     length: Float[Array, " z"]  # length scale of each input of the process
     scale: Float[Array, ""]  # unit of changes, in the unit of `space.log`
 
-    def more(self, space: Space, obs: Float[Array, "n obs"], action: Float[Array, "n a"]) -> Float[Array, "n cues"]:
+    def more(self, space: Space, obs: Observations, action: Float[Array, "n a"]) -> Float[Array, "n cues"]:
         """Return the mean of the process, in units of `scale`; `action`: the base's."""
         inputs = linear.inputs(space, self.frame, obs, action)
         return posterior.correlation(self.length, inputs, self.known) @ self.alpha
@@ -41,11 +41,11 @@ def corrected(
     space: Space,
     family: Family,
     correction: Correction,
-    obs: Float[Array, "n obs"],
-    before: Float[Array, "n obs"],
-    first: Float[Array, "n action"],
-    action: Float[Array, "n action"],
-) -> Float[Array, "n action"]:
+    obs: Observations,
+    before: Observations,
+    first: Actions,
+    action: Actions,
+) -> Actions:
     """Return corrected actions.
 
     `obs`, `before`: observations as they are, and as they would be without the change (`linear.undone`). `first`,
@@ -68,7 +68,7 @@ class ReadingPolicy(PolicyNode):
     family: Family = struct.field(pytree_node=False)  # empty: shifts and mixings of entries
     reference: str = struct.field(pytree_node=False, default="")  # reference of the family's code; empty: declared
 
-    def act(self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
+    def act(self, key: PRNGKeyArray, states: EnvState, obs: Observations) -> Actions:
         """Return the base's actions, corrected."""
         first = self.base.act(key, states, obs)
         before = linear.undone(self.family, self.correction.change, obs)
@@ -111,9 +111,7 @@ class ReadingPolicy(PolicyNode):
 
 # Compiled apart from the base, which may be plain Python.
 @partial(jax.jit, static_argnums=(0, 1))
-def _bounded(
-    space: Space, family: Family, correction: Correction, bound: Array, obs: Array, *rest: Array
-) -> Float[Array, "n action"]:
+def _bounded(space: Space, family: Family, correction: Correction, bound: Array, obs: Array, *rest: Array) -> Actions:
     """Return corrected actions, within a bound of the base's; `rest`: what `corrected` takes after `obs`."""
     around = linear.meant(family, correction.change.theta, rest[0], rest[2]) if has_effects(family) else rest[1]
     return space.clip(corrected(space, family, correction, obs, *rest), around, bound)

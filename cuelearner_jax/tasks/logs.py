@@ -38,7 +38,7 @@ from cuelearner_jax.storage import situations
 from cuelearner_jax.task import PAPER, Body, Preset, Task
 from cuelearner_jax.tasks.logs_pictures import PICTURES
 from cuelearner_jax.terminal import console
-from cuelearner_jax.types import Step
+from cuelearner_jax.types import Action, Observation, Step
 
 NAME = "logs"
 Actions = Literal["box", "directions", "choices"]
@@ -124,7 +124,7 @@ class Logs(WholeObservations, struct.PyTreeNode):
         """Return the layout without the situations."""
         return Logs(self.observation, self.actions, self.centre, self.scale)
 
-    def features(self, obs: Float[Array, " obs"], actions: Float[Array, "*n action"]) -> Features:
+    def features(self, obs: Observation, actions: Float[Array, "*n action"]) -> Features:
         """Return the observation and actions, scaled to entries of the order of 1."""
         own = jnp.clip((obs - self.centre) / self.scale, -FARTHEST, FARTHEST)
         if not isinstance(self.actions, Box):
@@ -133,20 +133,18 @@ class Logs(WholeObservations, struct.PyTreeNode):
         return Features(own, 2 * self.actions.log(middle, actions))
 
     @property
-    def heuristic(self) -> Callable[[Float[Array, " obs"]], Float[Array, " action"]] | None:
+    def heuristic(self) -> Callable[[Observation], Action] | None:
         """The proposed action of an observation that holds it; None where observations hold none."""
         if not self.observation or self.observation[-1].kind != PROPOSED:
             return None
         return lambda obs: self.actions.retract(obs[-self.actions.size :])
 
-    def reset(self, key: PRNGKeyArray) -> tuple[SituationState, Float[Array, " obs"]]:
+    def reset(self, key: PRNGKeyArray) -> tuple[SituationState, Observation]:
         """Return a random situation."""
         row = jax.random.randint(key, (), 0, len(self.rows))
         return SituationState(row, jnp.zeros((), jnp.int32)), self.rows[row]
 
-    def step(
-        self, key: PRNGKeyArray, state: SituationState, action: Float[Array, " action"]
-    ) -> tuple[SituationState, Step]:
+    def step(self, key: PRNGKeyArray, state: SituationState, action: Action) -> tuple[SituationState, Step]:
         """Return the next situation, whatever the action; after all of them a random one."""
         following = SituationState((state.row + 1) % len(self.rows), state.count + 1)
         final_obs, (anew, first) = self.rows[following.row], self.reset(key)
