@@ -65,7 +65,5 @@ def check(kind: str, values: Any, path: Path) -> None:
     if type(number) is not int:
         raise damage_error(kind, path)
     if number != FORMATS[kind]:
-        raise UserError(
-            f"{path} is of format {number}, this program reads format {FORMATS[kind]}: use the cuelearner that wrote "
-            "it, or make it anew with this one"
-        )
+        advice = "use the cuelearner that wrote it, or make it anew with this one"
+        raise UserError(f"{path} is of format {number}, this program reads format {FORMATS[kind]}: {advice}")

@@ -215,10 +215,8 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
     for seed, budget in zip(seeds, budgets, strict=True):
         rows = np.flatnonzero(file.seeds == (own_seeds[0] if len(own_seeds) == 1 else seed))
         if not len(rows):
-            raise UserError(
-                f"the label file has labels for the seeds {format_numbers(own_seeds.tolist())}, none for seed {seed}: "
-                "give --seeds (train: --seed) for these, or the labels of another run"
-            )
+            why = f"the label file has labels for the seeds {format_numbers(own_seeds.tolist())}, none for seed {seed}"
+            raise UserError(f"{why}: give --seeds (train: --seed) for these, or the labels of another run")
         if len(rows) < budget:
             there = f"the label file has {len(rows)} labels for seed {seed}, the budget is {budget}"
             raise UserError(f"{there}: lower --labels or collect more")

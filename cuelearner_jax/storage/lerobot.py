@@ -76,9 +76,8 @@ def _parts(path: Path, features: dict[str, Any], name: str, cameras: list[str]) 
     others = {key for key in features if key.startswith(name)} - {*cameras}
     if not parts and (name != OBSERVATION or others or not cameras):
         there = ", ".join(features)
-        raise UserError(
-            f"{path} has no feature {name} or {name}.PART of numbers (it has {there}): give a dataset with one"
-        )
+        advice = "give a dataset with one"
+        raise UserError(f"{path} has no feature {name} or {name}.PART of numbers (it has {there}): {advice}")
     return parts
 
 
@@ -90,10 +89,8 @@ def _features(path: Path) -> dict[str, Any]:
     except (ValueError, KeyError, TypeError) as error:
         raise _damage_error(path / INFO, error) from error
     if version != VERSION:
-        raise UserError(
-            f"{path} is a LeRobot dataset of the format {format_value(version)}, {VERSION} is needed: convert it by "
-            "LeRobot's own script first"
-        )
+        why = f"{path} is a LeRobot dataset of the format {format_value(version)}, {VERSION} is needed"
+        raise UserError(f"{why}: convert it by LeRobot's own script first")
     return features
 
 

@@ -83,10 +83,8 @@ def check_complete(folder: Path, step: int, count: int, run: str) -> None:
                 raise UserError(f"{path} belongs to another run: put its own back")
             rows = table.filter(pc.field("step") <= step).num_rows if table.num_rows else 0
     if rows != count:
-        raise UserError(
-            f"{folder} has {rows} of {count} results up to step {step}: restore its table, or move the folder "
-            "away and give --resume, which trains these lanes anew"
-        )
+        advice = "restore its table, or move the folder away and give --resume, which trains these lanes anew"
+        raise UserError(f"{folder} has {rows} of {count} results up to step {step}: {advice}")
 
 
 def read(paths: PathLike | Sequence[PathLike], schema: tables.Schema = SCHEMA) -> pa.Table:

@@ -139,9 +139,8 @@ def _situations_of(
         if not rows.size:
             raise UserError(f"{path} holds no {name}s: record some situations first")
         if len(wrong := np.flatnonzero(~np.isfinite(rows).all(-1))):
-            raise UserError(
-                f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: leave them out"
-            )
+            advice = "leave them out"
+            raise UserError(f"{path}: {name}s of the rows {format_numbers(wrong.tolist())} are not finite: {advice}")
         contents.update(str(rows.shape).encode() + np.ascontiguousarray(rows).tobytes())
     contents.update("\n".join([quantity.name for quantity in slices] + ["", *entries]).encode())
     return Situations(observations, actions, tuple(slices), entries, contents.hexdigest()[:12])
@@ -197,10 +196,8 @@ def _matrix(table: Path, columns: dict[str, Any], name: str) -> tuple[Float[np.n
     """Return the numbers (n, size) of a column of lists, or of one column per entry, and the names of the entries."""
     entries = tuple(column.partition(".")[2] for column in columns if column.startswith(f"{name}."))
     if (name in columns) == bool(entries):
-        raise UserError(
-            f"{table} has the columns {', '.join(columns) or 'none'}: give one column {name} with a list per row, or "
-            f"{name}.NAME columns"
-        )
+        advice = f"give one column {name} with a list per row, or {name}.NAME columns"
+        raise UserError(f"{table} has the columns {', '.join(columns) or 'none'}: {advice}")
     if not entries:
         return _numbers(table, name, columns[name], 2), ()
     parts = [_numbers(table, f"{name}.{entry}", columns[f"{name}.{entry}"], 1) for entry in entries]

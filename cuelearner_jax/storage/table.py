@@ -209,9 +209,8 @@ def read(path: Path, schema: Schema) -> pa.Table:
         raise UserError(f"{path} {schema.remedy} ({first_line(error)})") from error
     absent = [name for name in schema.required if name not in table.column_names]
     if absent and table.num_rows:
-        raise UserError(
-            f"{path} lacks the columns {', '.join(absent)}: it is not a table of {schema.stem} of this package"
-        )
+        why = f"it is not a table of {schema.stem} of this package"
+        raise UserError(f"{path} lacks the columns {', '.join(absent)}: {why}")
     return table
 
 

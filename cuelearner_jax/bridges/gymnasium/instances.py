@@ -296,9 +296,8 @@ class Instances:
             raise UserError(f"{one.whose} is the same instance each time: let the function make a new environment")
         size = sum(leaf.size for leaf in one.leaves)
         if size != self.size:
-            raise UserError(
-                f"{one.whose} has observations of {size} entries, its task says {self.size}: name the environment anew"
-            )
+            advice = "name the environment anew"
+            raise UserError(f"{one.whose} has observations of {size} entries, its task says {self.size}: {advice}")
         self.running.append(one)
         return one
 

@@ -43,10 +43,8 @@ class Process:
         try:
             sent = cloudpickle.dumps((source.make, source.name, source.max_steps, source.size))
         except Exception as error:
-            raise UserError(
-                f"environment {self.name} cannot be sent to another process ({error}): give a function or class of a "
-                "module, or processes 1"
-            ) from error
+            advice = "give a function or class of a module, or processes 1"
+            raise UserError(f"environment {self.name} cannot be sent to another process ({error}): {advice}") from error
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", "cuelearner_jax.bridges.gymnasium.pool", str(theirs.fileno())]
         paths = os.pathsep.join([str(PACKAGES), *filter(None, [os.environ.get("PYTHONPATH")])])

@@ -68,9 +68,8 @@ def registry_spec(name: str) -> Any:
     """Return the specification of an id in Gymnasium's registry, without importing the id's module."""
     check_installed()
     if ":" in name:
-        raise UserError(
-            f"the id {name!r} would import code: only its caller may name that, as gymnasium:{name} in place of TASK"
-        )
+        advice = f"only its caller may name that, as gymnasium:{name} in place of TASK"
+        raise UserError(f"the id {name!r} would import code: {advice}")
     import gymnasium
 
     # Where the caller imported that package, its environments are registered, and fail.
@@ -118,9 +117,8 @@ def register_robotics() -> None:
             import gymnasium_robotics
         except AttributeError as error:  # of PyOpenGL, which finds no library
             library = os.environ.get("MUJOCO_GL", "")
-            raise UserError(
-                f"MUJOCO_GL={library} finds no library: install libosmesa6 or libegl1, or set MUJOCO_GL=egl or osmesa"
-            ) from error
+            advice = "install libosmesa6 or libegl1, or set MUJOCO_GL=egl or osmesa"
+            raise UserError(f"MUJOCO_GL={library} finds no library: {advice}") from error
 
     gymnasium.register_envs(gymnasium_robotics)
     _supply_joint_types()
