@@ -65,10 +65,8 @@ class RunConfig(Generic[KindsT]):
         if self.sizes.ask_from == "middle" and not isinstance(space, Box):
             raise UserError(f"sizes.ask_from is middle, but only a box has one, not {space.name}: leave it out")
         if self.sizes.store_labelled and guide.form is not None and guide.form.correct is None:
-            raise UserError(
-                f"sizes.store_labelled executes what answers ask for, but {guide.form.name} answers name no action: "
-                f"leave it out, or leave out guidance {kind}"
-            )
+            why = f"sizes.store_labelled executes what answers ask for, but {guide.form.name} answers name no action"
+            raise UserError(f"{why}: leave it out, or leave out guidance {kind}")
         return guide
 
     def options_of(self, kind: str) -> Any:

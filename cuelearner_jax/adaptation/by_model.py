@@ -155,10 +155,8 @@ def check_amounts(space: Space, bounds: Sequence[float], scalars: Scalars | None
     if scalars is None or not tries:
         return
     if not space.grain <= eps <= min(bounds):
-        raise UserError(
-            f"labels of {eps:g} {space.unit} say nothing within a bound of {min(bounds):g}: give a scalars.eps_deg "
-            f"from {space.grain:g} on, about a tenth of the bound"
-        )
+        advice = f"give a scalars.eps_deg from {space.grain:g} on, about a tenth of the bound"
+        raise UserError(f"labels of {eps:g} {space.unit} say nothing within a bound of {min(bounds):g}: {advice}")
     if scalars.tau_deg >= eps:
         why = f"a pass moves an action by {eps:g}, after which refinement would stop"
         raise UserError(f"scalars.tau_deg is {scalars.tau_deg:g} and {why}: give scalars.tau_deg {eps / PASSES:g}")

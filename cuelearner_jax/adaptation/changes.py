@@ -69,16 +69,12 @@ def rebuild_family(layer: dict[str, Any], env: Any, changes: Any = None) -> Fami
     """
     code, names = layer["code"], layer["distortions"]
     if code and changes is None:
-        raise UserError(
-            f"this policy corrects changes of code, {code}, which is not loaded because a file names it: add "
-            f"--changes {code} (from Python changes=...) if you trust that code"
-        )
+        why = f"this policy corrects changes of code, {code}, which is not loaded because a file names it"
+        raise UserError(f"{why}: add --changes {code} (from Python changes=...) if you trust that code")
     by_name = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env))}
     family = tuple(by_name[name] for name in names if name in by_name)
     units = [(one["name"], one["unit"]) for one in layer["changes"]]
     if len(family) < len(names) or [(one.name, one.unit) for one in unknowns_of(family)] != units:
-        raise UserError(
-            f"this policy corrects {', '.join(names)}, which {code or 'this world'} lacks or has otherwise: give the "
-            "code that made the policy"
-        )
+        why = f"this policy corrects {', '.join(names)}, which {code or 'this world'} lacks or has otherwise"
+        raise UserError(f"{why}: give the code that made the policy")
     return family

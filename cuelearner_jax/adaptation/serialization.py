@@ -94,10 +94,8 @@ def from_json(values: dict[str, Any], env: Any, code: Any = None, changes: Any =
     if kind != "code":
         raise UserError(f"{kind!r} is not a kind of policy that this program knows: use the cuelearner that wrote it")
     if code is None:
-        raise UserError(
-            f"this policy is made of code, {values['named']}, which is not loaded because a file names it: add "
-            f"--base {values['named']} if you trust that code"
-        )
+        why = f"this policy is made of code, {values['named']}, which is not loaded because a file names it"
+        raise UserError(f"{why}: add --base {values['named']} if you trust that code")
     return policy_of(code, actions_of(env))
 
 
@@ -105,9 +103,7 @@ def _guidance(values: dict[str, Any], env: Any) -> Guide:
     """Return the guide of a guided policy. Raises UserError if no kind of that name is known."""
     name = values["guidance"]
     if name not in guidances.guides():
-        raise UserError(
-            f"the policy is under a guidance from outside, {name!r}: name its code by --guidance package.module:NAME, "
-            "if you trust that code"
-        )
+        advice = "name its code by --guidance package.module:NAME, if you trust that code"
+        raise UserError(f"the policy is under a guidance from outside, {name!r}: {advice}")
     sizes, options = configuration.from_json(GuideSizes, values["sizes"]), kind_from_json(name, values["options"])
     return guidances.make(name, sizes, env, options)

@@ -227,16 +227,12 @@ def _matrix(table: pa.Table, metric: str, kind: str, labels: int) -> tuple[np.nd
     if count.max() > 1:
         twice = seeds[(count > 1).any(axis=1)][0]
         where = sorted(set(table.filter(pc.field("seed") == int(twice))["folder"].to_pylist()))
-        raise UserError(
-            f"seed {twice} of {kind} guidance with {labels} labels occurs twice, in {' and '.join(where)}: "
-            "leave one of them out, or name each folder and add --by-run"
-        )
+        why = f"seed {twice} of {kind} guidance with {labels} labels occurs twice, in {' and '.join(where)}"
+        raise UserError(f"{why}: leave one of them out, or name each folder and add --by-run")
     whole = (count == 1).all(axis=0)
     if not whole.any():
-        raise UserError(
-            f"the seeds of {kind} guidance with {labels} labels have no step in common: wait until all have one, or "
-            "leave out the run that was evaluated at other steps"
-        )
+        advice = "wait until all have one, or leave out the run that was evaluated at other steps"
+        raise UserError(f"the seeds of {kind} guidance with {labels} labels have no step in common: {advice}")
     values = np.full(count.shape, np.nan)
     values[row, column] = table[metric].to_numpy()
     lists = table[f"{metric}_each"].to_pylist() if f"{metric}_each" in table.column_names else []

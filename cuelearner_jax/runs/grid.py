@@ -123,10 +123,8 @@ def load(folder: Path, find: Callable[[str], Task]) -> tuple[Task, RunConfig, Gr
     """
     path = folder / CONFIG
     if not path.is_file():
-        raise UserError(
-            f"{folder} is not a run folder (it has no config.json): give the --out of a train or sweep, or code as "
-            "module:NAME, which may load a model file"
-        )
+        advice = "give the --out of a train or sweep, or code as module:NAME, which may load a model file"
+        raise UserError(f"{folder} is not a run folder (it has no config.json): {advice}")
     values = formats.read("config", path)
     task, world = world_of(values["task"], find, path)
     config = run_config.from_json(world, values)
@@ -142,8 +140,6 @@ def world_of(values: dict[str, Any], find: Callable[[str], Task], path: Path) ->
     except UserError as error:
         if origin is None:
             raise UserError(f"{path} belongs to an unknown task ({error})") from error
-        raise UserError(
-            f"{path} belongs to a task outside the package; its code is not loaded just because a file names it: "
-            f"add --task {origin} if you trust that code"
-        ) from error
+        why = f"{path} belongs to a task outside the package; its code is not loaded just because a file names it"
+        raise UserError(f"{why}: add --task {origin} if you trust that code") from error
     return task, configuration.from_json(task.config, values)

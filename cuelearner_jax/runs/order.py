@@ -153,10 +153,8 @@ def read_labels(
             raise UserError(f"{path} holds {file.answers} answers, but {needs}: give fitting labels")
         external_labels.check_file(file, spaces_of(env), form, str(path))
     if file.eps is not None and not math.isclose(file.eps, scalars.eps_deg, rel_tol=1e-6):
-        raise UserError(
-            f"{path} holds labels of {file.eps:g} {file.space.unit}, the run expects {scalars.eps_deg:g}: "
-            f"give --scalars.eps-deg {file.eps:g}, or other labels"
-        )
+        why = f"{path} holds labels of {file.eps:g} {file.space.unit}, the run expects {scalars.eps_deg:g}"
+        raise UserError(f"{why}: give --scalars.eps-deg {file.eps:g}, or other labels")
     for kind in asking:
         seeds, budgets = grid.lanes(kind)
         label_files.for_lanes(file, seeds, budgets, label_slots(int(budgets.max()), sizes))

@@ -122,9 +122,8 @@ class PolicySource:
         kinds = self.adapted.kinds if self.adapted else guidance or (self.grid.guidance if self.grid else ())
         weighs_aims = any("aims" in kind.needs for name in kinds if (kind := guidances.guides().get(name)))
         if weighs_aims and (width := spaces_of(own).aims) != (now := spaces_of(after).aims):
-            raise UserError(
-                f"the {what} uses aims of {width} features, this world's have {now}: keep the options that set the aims"
-            )
+            advice = "keep the options that set the aims"
+            raise UserError(f"the {what} uses aims of {width} features, this world's have {now}: {advice}")
 
     def load(self, kinds: tuple[str, ...] = ()) -> list[Block]:
         """Return the lanes of a run's kinds of guidance (none named: all), grouped by step; see `lanes_of`."""
@@ -134,10 +133,8 @@ class PolicySource:
             if name not in self.grid.guidance:
                 raise UserError(f"{self.folder} has no guidance {name!r}: choose among {', '.join(self.grid.guidance)}")
             if name not in guidances.guides():
-                raise UserError(
-                    f"{self.folder} has lanes of a guidance outside the package, {name!r}: name its code by "
-                    "--guidance package.module:NAME, if you trust that code"
-                )
+                advice = "name its code by --guidance package.module:NAME, if you trust that code"
+                raise UserError(f"{self.folder} has lanes of a guidance outside the package, {name!r}: {advice}")
             pieces = self.pieces or (Piece(self.folder, self.grid),)
             groups += lanes_of(self.task, self.config, pieces, name, sweep=pieces[0].folder != self.folder)
         return groups
@@ -192,10 +189,8 @@ class PolicySource:
             return rest
         words = [f"seed {format_numbers(seeds)}"] * bool(seeds) + [f"{format_numbers(labels)} labels"] * bool(labels)
         near, others = (f" within {text} {unit}" if bound else "" for text in (f"{bound:g}", format_numbers(there[2])))
-        raise UserError(
-            f"{self.folder} has no lane with {' and '.join(words)}{near}: there are seeds {format_numbers(there[0])} "
-            f"and labels {format_numbers(there[1])}{others}"
-        )
+        why = f"there are seeds {format_numbers(there[0])} and labels {format_numbers(there[1])}{others}"
+        raise UserError(f"{self.folder} has no lane with {' and '.join(words)}{near}: {why}")
 
     def _policy(self, name: str, block: Block, view: Any, teacher: Teacher | None) -> Any:
         config = self.config

@@ -52,9 +52,8 @@ class Shard(NamedTuple):
     def seeds(self, seeds: tuple[int, ...]) -> tuple[int, ...]:
         """Return the shard's share of a sweep's seeds; shares differ by at most one seed."""
         if self.count > len(seeds):
-            raise UserError(
-                f"--shard: {len(seeds)} seeds cannot be divided into {self.count} shards: give at most {len(seeds)}"
-            )
+            advice = f"give at most {len(seeds)}"
+            raise UserError(f"--shard: {len(seeds)} seeds cannot be divided into {self.count} shards: {advice}")
         return tuple(int(seed) for seed in np.array_split(np.array(seeds), self.count)[self.index - 1])
 
 
