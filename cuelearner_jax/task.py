@@ -189,10 +189,8 @@ class Task:
     def make_teacher(self, config: Any, env: Environment, questions: int | None = None) -> Teacher:
         """Return the teacher of a world, who gets so many questions, if known. Raises UserError if there is none."""
         if self.teacher is None:
-            raise UserError(
-                f"{self.name} has no teacher to ask: give --teacher module:NAME, --labels-from, or a guidance without "
-                "labels"
-            )
+            advice = "give --teacher module:NAME, --labels-from, or a guidance without labels"
+            raise UserError(f"{self.name} has no teacher to ask: {advice}")
         brief = questions is not None and self.brief_teacher and self.brief_teacher(config, env, questions)
         return brief or self.teacher(config, env)
 

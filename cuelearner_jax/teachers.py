@@ -77,10 +77,8 @@ def save(folder: Path, teacher: LearnedTeacher, about: dict[str, Any]) -> None:
     """
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float16), teacher.params)
     if not all_finite(params):
-        raise NotFinite(
-            f"the teacher's weights are not finite, or beyond {jnp.finfo(jnp.float16).max}: it was not written to "
-            f"{folder}; train with a smaller --teacher.learning-rate and another --out"
-        )
+        advice = f"it was not written to {folder}; train with a smaller --teacher.learning-rate and another --out"
+        raise NotFinite(f"the teacher's weights are not finite, or beyond {jnp.finfo(jnp.float16).max}: {advice}")
     folder.mkdir(parents=True, exist_ok=True)
     if (folder / "network").exists():  # delete an earlier teacher's file, which would be kept
         shutil.rmtree(folder / "network")

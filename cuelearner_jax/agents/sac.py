@@ -85,13 +85,11 @@ class SACConfig:
     def make(self, frame: Frame, spaces: Spaces, bootstraps: bool = False) -> SoftActorCritic:
         """Return the agent for an environment's spaces."""
         if not isinstance(spaces.actions, Box):
-            raise UserError(
-                f"agent 'sac' acts in boxes, not in {spaces.actions.name}: give --agent ddqn, which serves any space"
-            )
+            advice = "give --agent ddqn, which serves any space"
+            raise UserError(f"agent 'sac' acts in boxes, not in {spaces.actions.name}: {advice}")
         if frame != "raw":
-            raise UserError(
-                f"sizes.frame is {frame!r}, but the actor of 'sac' has no action as input: give --sizes.frame raw"
-            )
+            advice = "give --sizes.frame raw"
+            raise UserError(f"sizes.frame is {frame!r}, but the actor of 'sac' has no action as input: {advice}")
         return SoftActorCritic(self, frame, spaces, bootstraps)
 
     def check(self, sizes: Sizes, bootstraps: bool) -> None:

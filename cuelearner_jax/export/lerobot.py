@@ -140,9 +140,8 @@ def _read(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise UserError(
-            f"{path} cannot be read: give --policy a LeRobot checkpoint, a folder pretrained_model"
-        ) from error
+        advice = "give --policy a LeRobot checkpoint, a folder pretrained_model"
+        raise UserError(f"{path} cannot be read: {advice}") from error
 
 
 def _check(checkpoint: Path, config: dict[str, Any], sizes: dict[str, int], names: tuple[str, ...]) -> None:
@@ -155,9 +154,8 @@ def _check(checkpoint: Path, config: dict[str, Any], sizes: dict[str, int], name
             raise UserError(f"{name} {own} in {checkpoint}, and {size} in the correction: {advice}")
     own = tuple(config.get("action_feature_names") or ())
     if own and names and own != names:
-        raise UserError(
-            f"{checkpoint} moves {', '.join(own)}, the correction {', '.join(names)}: give the labelled one"
-        )
+        remedy = "give the labelled one"
+        raise UserError(f"{checkpoint} moves {', '.join(own)}, the correction {', '.join(names)}: {remedy}")
 
 
 def _check_steps(checkpoint: Path, pre: dict[str, Any], post: dict[str, Any]) -> None:
@@ -170,9 +168,8 @@ def _check_steps(checkpoint: Path, pre: dict[str, Any], post: dict[str, Any]) ->
         raise UserError(f"{checkpoint} holds a correction already: give the checkpoint that it was made from")
     for name, of, normaliser in ((PRE, pre, NORMALIZER), (POST, post, UNNORMALIZER)):
         if normaliser not in [step.get("registry_name") for step in of["steps"]]:
-            raise UserError(
-                f"{checkpoint / name} has no {normaliser}, beside which a correction acts: give another policy"
-            )
+            advice = "give another policy"
+            raise UserError(f"{checkpoint / name} has no {normaliser}, beside which a correction acts: {advice}")
 
 
 def _place(pipeline: dict[str, Any], name: str) -> int:

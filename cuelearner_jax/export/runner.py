@@ -96,9 +96,8 @@ class Decision:
         rows, sizes = parts[0].shape[:-1], (self._size, *[self._base] * self._calls)
         for part, size in zip(parts, sizes, strict=False):
             if len(rows) > 1 or part.shape != (*rows, size):
-                raise ContractError(
-                    f"observations or base actions have shape {part.shape}: give ({size},), or equally many (n, {size})"
-                )
+                advice = f"give ({size},), or equally many (n, {size})"
+                raise ContractError(f"observations or base actions have shape {part.shape}: {advice}")
         if not all(np.isfinite(part).all() for part in parts):
             raise ContractError("an observation holds numbers that are not finite, or beyond single precision")
         return parts

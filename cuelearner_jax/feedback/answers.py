@@ -45,10 +45,8 @@ class AnswerForm(NamedTuple):
 def check_teacher(teacher: Any, faults: TeacherFaults) -> None:
     """Raise UserError if a teacher cannot give the answers that `scalars.answer` asks for."""
     if faults.answer == "nearest" and not isinstance(teacher, ValuesDirections):
-        raise UserError(
-            "scalars.answer is nearest, but this teacher knows only the best action, not the values of others: "
-            "give --scalars.answer best"
-        )
+        why = "scalars.answer is nearest, but this teacher knows only the best action, not the values of others"
+        raise UserError(f"{why}: give --scalars.answer best")
 
 
 def intended_action(

@@ -76,8 +76,6 @@ def make(name: str, sizes: GuideSizes, env: Any, options: Any = None) -> Guide:
     kind = find(name)
     for need in kind.needs:
         if not offers(env, need):
-            raise UserError(
-                f"guidance {name!r} needs an environment with `{need}`, which this task does not have: "
-                "choose another guidance"
-            )
+            why = f"guidance {name!r} needs an environment with `{need}`, which this task does not have"
+            raise UserError(f"{why}: choose another guidance")
     return kind(sizes, spaces_of(env), options)

@@ -167,9 +167,8 @@ def cues_from(words: Any, names: Sequence[str] = (), unit: str = SHARE) -> tuple
     if not names and len({*in_words}) < len(in_words):
         raise UserError(f"cues is {format_value(words)}, the same words twice: give each entry its own")
     if names and len(names) != len(pairs):
-        raise UserError(
-            f"cues are {len(pairs)} pairs of words for {len(names)} entries of an action: give one an entry"
-        )
+        advice = "give one an entry"
+        raise UserError(f"cues are {len(pairs)} pairs of words for {len(names)} entries of an action: {advice}")
     keys_in_use = {HELD[word] for pair in pairs for word in pair if word in HELD}
     cues = []
     for number, pair in enumerate(pairs):

@@ -97,9 +97,8 @@ class GymnasiumConfig:
     def space(self) -> Space:
         """The space of actions. Raises UserError for bounds or cues that fit none."""
         if self.choices and self.cues:
-            raise UserError(
-                f"cues is {format_value(self.cues)}, but actions are choices without an order: leave it out"
-            )
+            advice = "leave it out"
+            raise UserError(f"cues is {format_value(self.cues)}, but actions are choices without an order: {advice}")
         if self.choices:
             return Choices(self.choices)
         return Box(self.low, self.high, cues_from(self.cues, self.cue_names) if self.cues else ())
@@ -116,9 +115,8 @@ def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig
     try:
         dict(**json.loads(config.arguments))
     except (ValueError, TypeError):
-        raise UserError(
-            f"task.arguments is {format_value(config.arguments)}: give arguments by name as JSON, '{{\"size\": 3}}'"
-        ) from None
+        advice = "give arguments by name as JSON, '{\"size\": 3}'"
+        raise UserError(f"task.arguments is {format_value(config.arguments)}: {advice}") from None
     if factory is None and ":" in name:  # the configuration is a file's
         factory = partial(_refuse, name)
     observation = config.observation
@@ -128,10 +126,8 @@ def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig
 
 
 def _refuse(name: str, **arguments: Any) -> Any:
-    raise UserError(
-        f"environment {name} is code, which is not imported because a file names it: name it again, by --env "
-        f"{FAMILY}:{name} or cl.from_gymnasium"
-    )
+    advice = f"name it again, by --env {FAMILY}:{name} or cl.from_gymnasium"
+    raise UserError(f"environment {name} is code, which is not imported because a file names it: {advice}")
 
 
 def _body(factory: Callable[..., Any] | None = None) -> Body:
