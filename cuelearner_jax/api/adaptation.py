@@ -326,9 +326,8 @@ def world_of(file: LabelFile, before: LogsConfig | None = None) -> World:
     """
     size, obs, space = file.labels.obs.shape[1], np.asarray(file.labels.obs), file.space
     if before is not None and logs.space_of(before) != space:
-        raise UserError(
-            "the policy was corrected with other bounds or cues before: leave out cues, low, high and space"
-        )
+        advice = "leave out cues, low, high and space"
+        raise UserError(f"the policy was corrected with other bounds or cues before: {advice}")
     recording = before or (from_json(LogsConfig, file.task) if file.task.get("name") == logs.NAME else None)
     if recording is not None and sum(recording.entries) == size:
         config = dataclasses.replace(recording, path="", digest="", order="recorded", rows=len(obs))

@@ -79,9 +79,8 @@ class World:
             value, action = action, numbers("action", action)
             if action.shape != (space.size,) or not space.usable(action, np):
                 example = np.asarray(space.spread(4))[0].round(2).tolist()
-                raise UserError(
-                    f"action is {format_value(value)}: give an action of shape ({space.size},), as {example}"
-                )
+                advice = f"give an action of shape ({space.size},), as {example}"
+                raise UserError(f"action is {format_value(value)}: {advice}")
         return jax.jit(self.env.step)(key, state, action)
 
 

@@ -257,10 +257,8 @@ def page_module(name: str) -> Any:
     try:
         module = import_module(f"cuelearner_jax.labelling.{name}")
     except ImportError as error:
-        raise UserError(
-            f"the page needs packages that are not installed ({error.name}): run `make setup`, or "
-            "pip install -c constraints.txt -e '.[label]' in the project's folder"
-        ) from error
+        advice = "run `make setup`, or pip install -c constraints.txt -e '.[label]' in the project's folder"
+        raise UserError(f"the page needs packages that are not installed ({error.name}): {advice}") from error
     # Set before JAX starts: each thread's computations run in that thread, at its priority (`learner`).
     jax.config.update("jax_cpu_enable_async_dispatch", False)
     return module

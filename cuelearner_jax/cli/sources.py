@@ -159,9 +159,8 @@ def _recording_task(subject: str, path: str | None) -> Task:
     labels = None if path is None else labels_from_file(Path(path))
     if labels is None or labels.task.get("name") != logs.NAME:
         why = "" if path is None else f", since {path} does not hold labels of a recording"
-        raise UserError(
-            f"{subject} needs a task to act in{why}: give one, for instance --task navigation or --env gymnasium:NAME"
-        )
+        advice = "give one, for instance --task navigation or --env gymnasium:NAME"
+        raise UserError(f"{subject} needs a task to act in{why}: {advice}")
     return world_of(labels).task
 
 
