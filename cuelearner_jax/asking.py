@@ -28,6 +28,7 @@ from cuelearner_jax.policies import Policy, best_actions, call_policy, policy_na
 from cuelearner_jax.types import EnvState, GuidanceModel, Label, Step, Teacher
 
 LaneT = TypeVar("LaneT", bound=Any)
+CandidateActions = Float[Array, "*candidates action"]
 
 ONE_BY_ONE = GuideSizes()  # sizes with one candidate a question, as a page asks
 
@@ -116,9 +117,7 @@ def start(
     )
 
 
-def question(
-    of: Inquiry, guide: GuideState, keys: QuestionKeys
-) -> tuple[Float[Array, "*candidates action"], Float[Array, "*candidates action"]]:
+def question(of: Inquiry, guide: GuideState, keys: QuestionKeys) -> tuple[CandidateActions, CandidateActions]:
     """Return the action to ask about in the guide's situation, or in each candidate, and the base policy's action."""
     space, scalars, several = actions_of(of.env), of.scalars, guide.obs.ndim > 1
     first = call_policy(of.base, keys.base, *_situations(guide), space)
@@ -158,9 +157,7 @@ def record(
     return guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=count)
 
 
-def proceed(
-    env: Environment, guide: GuideState, action: Float[Array, "*candidates action"], keys: QuestionKeys
-) -> GuideState:
+def proceed(env: Environment, guide: GuideState, action: CandidateActions, keys: QuestionKeys) -> GuideState:
     """Return the guide after the step that the action leads to, in each candidate by its own action."""
     if guide.obs.ndim > 1:
         state, step = jax.vmap(env.step)(jax.random.split(keys.env, len(guide.obs)), guide.env, action)
@@ -244,10 +241,7 @@ def ask(
 
 
 def _choose(
-    of: Inquiry,
-    guide: GuideState,
-    actions: Float[Array, "*candidates action"],
-    first: Float[Array, "*candidates action"],
+    of: Inquiry, guide: GuideState, actions: CandidateActions, first: CandidateActions
 ) -> tuple[EnvState, Float[Array, " obs"], Float[Array, " action"], Float[Array, " action"]]:
     """Return the situation to ask in (state, observation), the action to ask about, and the base policy's action.
 

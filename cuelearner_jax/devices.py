@@ -117,10 +117,7 @@ def compiler_options(lanes: int) -> dict[str, Any]:
     """
     if jax.default_backend() != "gpu":
         return {}
-    return {
-        "xla_gpu_command_buffer_scheduling_mode": "CONCURRENT",
-        "xla_gpu_enable_triton_gemm": lanes < LIBRARY_LANES,
-    }
+    return {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT", "xla_gpu_enable_triton_gemm": lanes < LIBRARY_LANES}
 
 
 def lane_mesh(devices: Sequence[Any] | None = None) -> Mesh:

@@ -56,11 +56,8 @@ def machine_message(error: BaseException, resumes: bool) -> str | None:
         return f"the disk is full: free some, then {again}"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}; what was saved before is safe"
-    if (
-        isinstance(error, MemoryError)
-        or errno.ENOMEM in numbers
-        or re.search("RESOURCE_EXHAUSTED|Out of memory", words)
-    ):
+    is_scarce = isinstance(error, MemoryError) or errno.ENOMEM in numbers
+    if is_scarce or re.search("RESOURCE_EXHAUSTED|Out of memory", words):
         lower = "lower the sizes that were given, or the number of seeds at once"
         return f"not enough memory ({first_line(error)}): {lower}"
     return None

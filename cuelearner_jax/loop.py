@@ -207,11 +207,8 @@ class Lane(NamedTuple):
         if agent.guided is not None:
             agent = agent.replace(guided=count_guided(agent.guided, clock.step, acted.passes > 0))
         passes = acted.passes.astype(jnp.float32)
-        metrics = {
-            "reward": step.reward.mean(),
-            "passes": passes.mean(),
-            "guided_share": (passes > 0).astype(jnp.float32).mean(),
-        }
+        guided = (passes > 0).astype(jnp.float32)
+        metrics = {"reward": step.reward.mean(), "passes": passes.mean(), "guided_share": guided.mean()}
         return state.replace(agent=agent, arbiter=arbiter), metrics
 
     def learn(

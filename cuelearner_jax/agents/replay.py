@@ -129,12 +129,7 @@ class Memory(NamedTuple):
     labelled: Memory | None = None  # labelled steps, one environment's; None: none are kept
 
     def batches(
-        self,
-        key: PRNGKeyArray,
-        size: int,
-        n_step: int = 1,
-        discount: Number = 0.0,
-        guided_share: Number | None = None,
+        self, key: PRNGKeyArray, size: int, n_step: int = 1, discount: Number = 0.0, guided_share: Number | None = None
     ) -> list[Transition]:
         """Draw transitions (size,), each under a random symmetry of the environment.
 
@@ -273,15 +268,9 @@ def buffer_for(env: Environment, bootstraps: bool) -> RingBuffer:
 def stored_step(obs: Float[Array, " memory"], action: Action, step: Step, bootstraps: bool) -> StoredStep:
     """Return what replay stores of one step from the remembered observation `obs`."""
     entries = slice(None) if bootstraps else slice(0)
-    ended: Bool[Array, ""] = step.terminated | step.truncated
-    return StoredStep(
-        obs=obs,
-        action=action,
-        reward=step.reward,
-        discount=1.0 - step.terminated[None].astype(jnp.float32)[entries],
-        ended=ended[None].astype(jnp.float32)[entries],
-        aftermath=step.aftermath[entries],
-    )
+    flags = step.terminated, step.terminated | step.truncated
+    terminated, ended = (flag[None].astype(jnp.float32)[entries] for flag in flags)
+    return StoredStep(obs, action, step.reward, 1.0 - terminated, ended, step.aftermath[entries])
 
 
 def apply_symmetries(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:
