@@ -53,9 +53,7 @@ def check_acts(family: Family, env: Environment) -> None:
             ("sees", obs, jax.vmap(partial(undo_observation, (one,), nothing))(obs)),
             ("acts" if one.plans is None else "plans", actions, acts(obs, actions)),
         ):
-            if result.shape != rows.shape or not np.allclose(
-                np.asarray(result), np.asarray(rows), atol=SAME, rtol=SAME
-            ):
+            if result.shape != rows.shape or not np.allclose(result, rows, atol=SAME, rtol=SAME):
                 raise UserError(
                     f"distortion {one.name!r}: {name} changes the shape or entries of a row although all of its "
                     "unknowns are zero: let it change nothing at zero"

@@ -241,14 +241,7 @@ def _act(space: Space, family: Family, fitted: Fit, obs: Array, before: Array, a
 
 @partial(jax.jit, static_argnames=("space", "family"))
 def _predicted(
-    space: Space,
-    family: Family,
-    fitted: Fit,
-    labels: RelativeLabels,
-    own: Array,
-    whole: Array,
-    action: Array,
-    eps: Any,
+    space: Space, family: Family, fitted: Fit, labels: RelativeLabels, own: Array, whole: Array, action: Array, eps: Any
 ) -> tuple[Array, Array, Array]:
     rows = linear.data(space, family, fitted.frame, fitted.hypothesis.change, labels, own, whole, eps)
     parts, hyper = fitted.hypothesis.parts, fitted.posterior.hyper

@@ -206,11 +206,7 @@ def answers_of(space: Space, labels: RelativeLabels, eps: Float[Array, ""]) -> A
 
 
 def features(
-    space: Space,
-    frame: ObservationFrame,
-    slope: Float[Array, "n cues u"],
-    obs: Observations,
-    base: Float[Array, "n a"],
+    space: Space, frame: ObservationFrame, slope: Float[Array, "n cues u"], obs: Observations, base: Float[Array, "n a"]
 ) -> Float[Array, "n cues p"]:
     """Return the change of each cue by each weight."""
     n, cues, _ = slope.shape

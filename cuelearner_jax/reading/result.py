@@ -126,14 +126,12 @@ def _changes_of_observation(
 ) -> list[Estimate]:
     """Return changes of what is seen; unknowns of proportional effects are one."""
     length = np.linalg.norm(effect, axis=0)
-    open_unknowns = [k for k in np.argsort(-np.abs(mean) * length) if length[k] > 1e-6 and root[k].any()]
+    remaining = [k for k in np.argsort(-np.abs(mean) * length) if length[k] > 1e-6 and root[k].any()]
     estimates = []
-    while open_unknowns:
-        largest = open_unknowns[0]
-        alike = [
-            k for k in open_unknowns if abs(effect[:, largest] @ effect[:, k]) >= ALIKE * length[largest] * length[k]
-        ]
-        open_unknowns = [k for k in open_unknowns if k not in alike]
+    while remaining:
+        largest = remaining[0]
+        alike = [k for k in remaining if abs(effect[:, largest] @ effect[:, k]) >= ALIKE * length[largest] * length[k]]
+        remaining = [k for k in remaining if k not in alike]
         first, members = min(alike), np.sort(alike)
         share = effect[:, first] @ effect[:, members] / (length[first] ** 2)
         value, deviation = share @ mean[members], float(np.linalg.norm(share @ root[members]))

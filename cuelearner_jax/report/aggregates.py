@@ -103,11 +103,8 @@ def _aggregate(
         pairs = zip(tasks, (scores(unguided_of(one, variants) or one) for one in own), strict=True)
         numbers[IMPROVEMENT] = spread(np.mean([improvement(*pair) for pair in pairs], axis=0))
     above = [(np.concatenate(tasks, axis=1) > score).mean(axis=1) for score in THRESHOLDS]
-    return (
-        replace(own[0], task="", failed=own[0].failed[:0]),
-        Curve(THRESHOLDS, *spread(np.stack(above, axis=-1))),
-        numbers,
-    )
+    profile = Curve(THRESHOLDS, *spread(np.stack(above, axis=-1)))
+    return replace(own[0], task="", failed=own[0].failed[:0]), profile, numbers
 
 
 def section(over: Aggregates, level: float | None) -> list[str]:

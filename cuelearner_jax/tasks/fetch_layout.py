@@ -27,10 +27,7 @@ _MOTION = (
     Quantity("object velocity", 3, "m a step", "relative to the gripper"),
     Quantity("object angular velocity", 3, "rad a step"),
 )
-_GRIPPER_MOTION = (
-    Quantity("gripper velocity", 3, "m a step"),
-    Quantity("finger velocities", 2, "m a step"),
-)
+_GRIPPER_MOTION = (Quantity("gripper velocity", 3, "m a step"), Quantity("finger velocities", 2, "m a step"))
 _DESIRED = Quantity("desired goal", 3, "m", "where the gripper, or the object, is to be")
 # The camera looks over the robot's shoulder, so that its left is to the left. Fetch's own faces the robot.
 CAMERA = {"distance": 1.6, "azimuth": 45.0, "elevation": -30.0, "lookat": [1.3, 0.75, 0.5]}
