@@ -24,7 +24,7 @@ _conf = BeartypeConf(is_pep484_tower=True, violation_type=jaxtyping.TypeCheckErr
 _with_dimensions = jaxtyping.jaxtyped
 # Of jaxtyping, and the package's aliases of such.
 _named = re.compile(
-    r"\b(Float|Int|UInt|Bool|Shaped|Num|Integer|Key|PyTree|PRNGKeyArray|Observations?|Actions?|Rows|Number)\b"
+    r"\b(Float|Int|UInt|Bool|Shaped|Num|Integer|Key|PyTree|PRNGKeyArray|Observations?|(Candidate)?Actions?|Rows|Number)\b"
 )
 
 
