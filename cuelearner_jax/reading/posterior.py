@@ -29,6 +29,7 @@ ITERATIONS = 30
 STEP = 0.15  # Adam's step of logarithms
 DAMPING = 0.5  # share of a new site in each iteration
 LEAST_PRECISION = 1e-3
+SMALL = 64  # rows of a triangle that is inverted in one piece
 
 
 class Data(struct.PyTreeNode):
@@ -135,44 +136,72 @@ def _solve(hyper: Hyper, parts: ModelParts, data: Data, precision: Array, target
     """Return the posterior under pseudo-measurements `target` (n, cues) of f with `precision`."""
     size = parts.weights * SIZE * jnp.exp(hyper.groups[jnp.array(data.group)] + hyper.sizes)
     x = data.features * size[None, None]  # (n, cues, p)
-    residual = target - data.offset
+    residual, away = target - data.offset, jnp.moveaxis(x, 1, 0)  # (cues, n, p)
     root = jnp.sqrt(precision).T  # (cues, n)
-    hx, hr = root[:, :, None] * jnp.moveaxis(x, 1, 0), root * residual.T
-    logs, hk, back, prior = jnp.zeros(()), None, None, jnp.zeros(residual.shape[1])
+    hx, hr = root[:, :, None] * away, root * residual.T
+    whitened = hx, hr, jnp.zeros_like(root)  # without the process the noise, in units of its own, is all there is
+    logs, prior = jnp.zeros(()), jnp.zeros(residual.shape[1])
     if parts.process:
         prior = amplitudes(hyper)
         correlations = correlation(lengths(hyper), data.inputs, data.inputs)
-        hx, hr, hk, back, logs = each_lane(partial(_whitened, correlations))(hx, hr, root, prior)
-        logs = logs.sum()
-    inner = jnp.linalg.cholesky(jnp.eye(len(size)) + jnp.einsum("cnp,cnq->pq", hx, hx))
+        *whitened, logs = each_lane(partial(_whitened, correlations))(hx, hr, root, prior)
+    of_x, of_r, known = whitened
+    inner = jnp.linalg.cholesky(jnp.eye(len(size)) + jnp.einsum("cnp,cnq->pq", hx, of_x))
     solve = partial(jax.scipy.linalg.solve_triangular, inner, lower=True)
-    vector = solve(jnp.einsum("cnp,cn->p", hx, hr))
+    vector = solve(jnp.einsum("cnp,cn->p", hx, of_r))
     weights = jax.scipy.linalg.solve_triangular(inner.T, vector, lower=False)  # in units of size
-    rest = hr - hx @ weights  # (cues, n)
-    mean, away = data.offset + x @ weights, jnp.moveaxis(x, 1, 0)
-    variance, alpha = (prior**2)[:, None], jnp.zeros_like(residual)
-    if hk is not None and back is not None:
-        alpha = jnp.einsum("cnm,cm->nc", back, rest)
-        mean = mean + jnp.einsum("cnm,cn->mc", hk, rest)
-        away = away - jnp.einsum("cnm,cnp->cmp", hk, hx)  # (cues, n, p)
-        variance = variance - (hk**2).sum(1)
+    rest = of_r - of_x @ weights  # (cues, n)
+    noise = jnp.where(root > 0, 1 / jnp.where(root > 0, root, 1.0), 0.0)  # none of what was not answered
+    mean = data.offset + x @ weights + (noise * (hr - hx @ weights - rest)).T
+    away = away - noise[:, :, None] * (hx - of_x)
+    variance = jnp.where(root > 0, known * noise**2, (prior**2)[:, None])
     spread = (solve(away.reshape(-1, len(size)).T) ** 2).sum(0).reshape(away.shape[:2])
-    variance = (variance + spread).T
-    log_z = -0.5 * (logs + 2 * jnp.log(jnp.diag(inner)).sum() + (hr**2).sum() - (vector**2).sum())
+    log_z = -0.5 * (logs.sum() + 2 * jnp.log(jnp.diag(inner)).sum() + (hr * of_r).sum() - (vector**2).sum())
     covariance_root = size[:, None] * jax.scipy.linalg.solve_triangular(inner.T, jnp.eye(len(size)), lower=False)
-    return _Solved(mean, jnp.maximum(variance, 1e-8), size * weights, covariance_root, alpha, log_z)
+    variance = jnp.maximum((variance + spread).T, 1e-8)
+    return _Solved(mean, variance, size * weights, covariance_root, (root * rest).T, log_z)
 
 
 def _whitened(
     correlations: Array, hx: Array, hr: Array, root: Array, amplitude: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Return one cue's features, residuals and covariance, whitened by process and noise; the last maps to `alpha`."""
-    eye = jnp.eye(len(root))
-    half_k = root[:, None] * (amplitude**2 * correlations)
-    factor = jnp.linalg.cholesky(eye + half_k * root[None])
-    inverse = jax.scipy.linalg.solve_triangular(factor, eye, lower=True)
-    back = root[:, None] * inverse.T
-    return inverse @ hx, inverse @ hr, inverse @ half_k, back, 2 * jnp.log(jnp.diag(factor)).sum()
+) -> tuple[Array, Array, Array, Array]:
+    """Return one cue's features and residuals times the inverse of process and noise, in units of the noise.
+
+    Also the diagonal of 1 minus that inverse, which is the variance of the process in these units, and the logarithm
+    of its determinant.
+    """
+    inverse, logs = _inverse(jnp.eye(len(root)) + amplitude**2 * root[:, None] * correlations * root[None])
+    return inverse @ hx, inverse @ hr, 1 - jnp.diag(inverse), logs
+
+
+@jax.custom_vjp
+def _inverse(whole: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
+    """Return the inverse of a positive definite matrix, and the logarithm of its determinant.
+
+    Their slopes are two products of matrices, where those of a Cholesky factor are several slow solutions.
+    """
+    factor = jnp.linalg.cholesky(whole)
+    root = _of_triangle(factor)
+    return _product(root.T, root), 2 * jnp.log(jnp.diag(factor)).sum()
+
+
+def _slopes(inverse: Array, slopes: tuple[Array, Array]) -> tuple[Array]:
+    of_inverse, of_logs = slopes
+    return (of_logs * inverse - _product(_product(inverse, of_inverse), inverse),)
+
+
+_inverse.defvjp(lambda whole: (both := _inverse(whole), both[0]), _slopes)
+_product = partial(jnp.matmul, precision="highest")  # on a GPU too
+
+
+def _of_triangle(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Return the inverse of a lower triangle, by halves: products of matrices are the fastest there is."""
+    half = len(factor) // 2
+    if half < SMALL:
+        return jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(factor)), lower=True)
+    first, last = _of_triangle(factor[:half, :half]), _of_triangle(factor[half:, half:])
+    below = -_product(_product(last, factor[half:, :half]), first)
+    return jnp.block([[first, jnp.zeros((half, len(last)))], [below, last]])
 
 
 def _log_prior(hyper: Hyper, parts: ModelParts) -> Array:
