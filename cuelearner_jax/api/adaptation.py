@@ -172,6 +172,7 @@ def adapt(
     prefer, judge_by = (judge_by, PERSON) if callable(judge_by) else (None, judge_by)
     request = AdaptRequest.of(task, config, own_world.scenario, guidance, judge_by, file, eps_deg, scalars)
     options: dict[str, Any] = {
+        "task": own_world.config,  # the scenario's, with the caller's options on top
         "labels": request.labels if labels is None or isinstance(labels, str | os.PathLike | tuple) else (labels,),
         "bound_deg": request.bound_deg if bound_deg is None else (bound_deg,),
         "judge_bounds": request.judge_bounds if judge_bounds is None else tuple(judge_bounds),

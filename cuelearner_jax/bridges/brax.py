@@ -144,5 +144,5 @@ def from_brax(
         heuristic: observation -> the obvious action. Without this the guidance "heuristic" is refused.
         cues: one an entry of the box (default: the entry's name in the model, else its number, "more" and "less").
     """
-    layout, steps = layout_of(env, type(env.unwrapped).__name__), jnp.array(max_steps, jnp.int32)
+    layout, steps = layout_of(env, type(getattr(env, "unwrapped", env)).__name__), jnp.array(max_steps, jnp.int32)
     return JaxEnvironment(steps, FixedSimulator(env), layout.observation, layout.box(cues), heuristic)

@@ -124,7 +124,7 @@ class Decision:
 def units(actions: np.ndarray, space: dict[str, Any]) -> np.ndarray:
     """Return what differences of entries count in: an action's range in a box, else 1, or an entry that is larger."""
     sizes = np.maximum(np.abs(actions), 1)
-    ranges = np.subtract(space.get("high", ()), space.get("low", ()))
+    ranges = np.subtract(space["high"], space["low"]) if space.get("name") == "box" else ()
     sizes[..., : len(ranges)] = ranges
     return sizes
 

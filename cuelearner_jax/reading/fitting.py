@@ -79,6 +79,7 @@ def unfitted(space: Space, family: Family, obs_size: int) -> tuple[Hypothesis, H
         amplitudes=zero,
         length=zero,
         lengths=jnp.zeros(obs_size + space.size),
+        tau=zero,
         width=jnp.float32(WIDE),
         lapse=zero,
         actions=space.size,

@@ -58,6 +58,7 @@ class Hyper(struct.PyTreeNode):
     amplitudes: Float[Array, ""]
     length: Float[Array, ""]  # of all entries of the observation
     lengths: Float[Array, " z"]
+    tau: Float[Array, ""]
     width: Float[Array, ""]
     lapse: Float[Array, ""]
     actions: int = struct.field(pytree_node=False)  # entries of an action, the last of the process's inputs
@@ -72,7 +73,7 @@ WIDTH = 0.5  # of eps
 LAPSE = 0.05
 # Spreads of the priors' logarithms
 SPREADS = {"groups": 1.5, "sizes": 1.0, "amplitude": 1.0, "amplitudes": 0.5}
-SPREADS |= {"length": 1.5, "lengths": 0.7, "width": 0.7, "lapse": 0.7}
+SPREADS |= {"length": 1.5, "lengths": 0.7, "tau": 0.7, "width": 0.7, "lapse": 0.7}
 
 
 class Posterior(struct.PyTreeNode):
@@ -99,7 +100,7 @@ class _Solved(NamedTuple):
 def habits(hyper: Hyper, eps: Float[Array, ""] | float) -> Habits:
     """Return a teacher's habits; `eps`: strength of an answer in the unit of the changes."""
     lapse = jnp.clip(LAPSE * jnp.exp(hyper.lapse), 0.005, 0.6)
-    return Habits(jnp.asarray(TAU * eps), WIDTH * eps * jnp.exp(hyper.width), lapse)
+    return Habits(TAU * eps * jnp.exp(hyper.tau), WIDTH * eps * jnp.exp(hyper.width), lapse)
 
 
 @jax.jit
@@ -217,6 +218,8 @@ def infer(data: Data, parts: ModelParts, eps: Float[Array, ""], start: Posterior
     """
     answers = data.answers
     optimizer = optax.adam(STEP)
+    # Only who claims no change learns tau: a change beside a wide tau has several optima, some far from the truth.
+    learns_tau = 0.0 if parts.process else 1.0 * ~parts.weights.any()
 
     def bound(hyper: Hyper, precision: Array, target: Array) -> tuple[Array, _Solved]:
         solved = _solve(hyper, parts, data, precision, target)
@@ -232,6 +235,7 @@ def infer(data: Data, parts: ModelParts, eps: Float[Array, ""], start: Posterior
         both = (1 - DAMPING) * precision + DAMPING * site
         natural = (1 - DAMPING) * precision * target + DAMPING * (site * solved.mean + first)
         target = jnp.where(both > 0, natural / jnp.maximum(both, 1e-12), 0.0)
+        slope = slope.replace(tau=learns_tau * slope.tau)
         changes, state = optimizer.update(jax.tree.map(jnp.negative, slope), state)
         return (jax.tree.map(jnp.add, hyper, changes), state, both, target), None
 

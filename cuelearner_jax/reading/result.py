@@ -50,6 +50,7 @@ class Result(NamedTuple):
     changed: bool  # whether any change explains the answers better than none
     evidence: float  # log of the product of p(answers | corrected) / p(answers | as it was), each predicted [nats]
     estimates: tuple[Estimate, ...]
+    mixed: float  # typical correction of entries of the observation that are seen mixed, in the space's unit; 0: none
     depends: float  # typical correction that depends on the situation, in the space's unit; 0: none
     near: float | None  # share of the situations met that are like labelled ones, which corrections may depend on
     wrong: float  # share of answers about something else
@@ -61,6 +62,10 @@ class Result(NamedTuple):
         if not self.changed:
             return ["The answers ask for no change."]
         lines = [one.words() for one in self.estimates]
+        if self.mixed:
+            lines.append(
+                f"entries of the observation are seen mixed, which moves actions by {self.mixed:.3g} typically"
+            )
         if self.depends:
             near = f", near labels, where {self.near:.0%} of the situations met lie" if self.near is not None else ""
             lines.append(f"beyond that, corrections depend on the situation: {self.depends:.3g} typically{near}")
@@ -76,7 +81,7 @@ class Result(NamedTuple):
 
 def describe_fit(
     fitted: Fit, space: Space, family: Family, eps: float, observation: Sequence[Quantity], walk: Float[Floats, "m z"]
-) -> tuple[tuple[Estimate, ...], float, float | None, float]:
+) -> tuple[tuple[Estimate, ...], float, float, float | None, float]:
     """Return the entries of `Result` from `estimates` to `wrong`.
 
     `eps` is in the unit of `space.log`. `observation`: slices of the observation; empty: entries have numbers alone.
@@ -94,15 +99,18 @@ def describe_fit(
     own = slice(len(weights) - linear.terms(*fitted.hypothesis.change.action.shape).shape[1], None)
     estimates += _of_action(weights[own], root[own], effect[:, own], space, eps)
     hyper, inputs = fitted.posterior.hyper, fitted.data.inputs
-    more = np.asarray(posterior.process(fitted.posterior, inputs, inputs))[valid]
-    depends = float(space.to_unit(SCALE * eps * np.sqrt((more**2).mean()), np)) if len(more) else 0.0
-    depends = depends if depends > SMALL * float(space.to_unit(eps, np)) else 0.0
+    more = posterior.process(fitted.posterior, inputs, inputs)
+    mix = effect[:, unknowns : own.start] @ weights[unknowns : own.start]
+    sizes = [
+        SCALE * np.sqrt((each**2).mean()) if len(each) else 0.0 for each in (mix, np.asarray(more)[valid])
+    ]  # [eps]
+    mixed, depends = (float(space.to_unit(eps * size, np)) if size > SMALL else 0.0 for size in sizes)
     near = None
     if len(walk) and valid.any():
         alike = posterior.correlation(posterior.lengths(hyper), jnp.asarray(walk), inputs[valid])
         near = float((alike.max(1) >= ALIKE_SITUATION).mean())
     wrong = float(posterior.habits(hyper, 1 / SCALE).lapse)
-    return tuple(estimates), depends, near, wrong
+    return tuple(estimates), mixed, depends, near, wrong
 
 
 def _names(family: Family, count: int, observation: Sequence[Quantity]) -> list[tuple[str, str]]:
@@ -142,7 +150,10 @@ def _changes_of_observation(
         low, mid, high = sorted(step[first] * (value + NORMAL * deviation * SIDES))
         if family and unknowns_of(family)[first].is_log:
             low, mid, high = PER_CENT * np.expm1(np.array([low, mid, high]) / PER_CENT)
-        estimates.append(Estimate(f"{name} seen aside" if unit != "degrees" else name, unit, mid, low, high))
+        is_seen = not family or [one.sees for one in family for _ in one.unknowns][first]
+        estimates.append(
+            Estimate(f"{name} seen aside" if is_seen and unit != "degrees" else name, unit, mid, low, high)
+        )
     return estimates
 
 

@@ -151,7 +151,7 @@ class Reading:
     def result(self) -> Result:
         """Return the verdict."""
         if self.fits is None or self.fit is None:
-            return Result(False, False, 0.0, (), 0.0, None, 0.0, self.policy())
+            return Result(False, False, 0.0, (), 0.0, 0.0, None, 0.0, self.policy())
         number = int(fitting.best_of(self.fits))
         inputs = situations = jnp.asarray(self.situations)
         if len(situations):

@@ -188,8 +188,9 @@ def test_what_only_stablehlo_can_say_is_refused_of_the_others(tmp_path):
 
 def test_differences_count_by_the_range_of_an_action_and_by_a_larger_entry_of_a_question():
     """As of a correction alone: an action in a box, then an observation for the base."""
-    rows = np.array([[400.0, -0.01, 0.5, -30.0]])
-    np.testing.assert_allclose(runner.units(rows, {"low": [0, -0.02], "high": [500, 0.01]}), [[500, 0.03, 1, 30]])
+    rows, box = np.array([[400.0, -0.01, 0.5, -30.0]]), {"name": "box", "low": [0, -0.02], "high": [500, 0.01]}
+    np.testing.assert_allclose(runner.units(rows, box), [[500, 0.03, 1, 30]])
+    np.testing.assert_allclose(runner.units(rows, {**box, "name": "own"}), [[400, 1, 1, 30]])
 
 
 def test_golden_cases_are_those_that_rounding_does_not_turn():

@@ -24,7 +24,7 @@ def answered():
 
 def test_one_weight_has_the_posterior_of_its_integral_and_a_bound_below_its_evidence():
     data, zero = answered(), jnp.zeros(())
-    hyper = Hyper(jnp.zeros(1), jnp.zeros(1), jnp.zeros(1), zero, zero, jnp.zeros(1), zero, zero, 0)
+    hyper = Hyper(jnp.zeros(1), jnp.zeros(1), jnp.zeros(1), zero, zero, jnp.zeros(1), zero, zero, zero, 0)
     found = posterior.infer(data, PARTS, jnp.float32(EPS), posterior.unread(data, hyper))
     habits = posterior.habits(found.hyper, EPS)
     size = float(SIZE * np.exp(found.hyper.groups[0] + found.hyper.sizes[0]))
@@ -37,13 +37,13 @@ def test_one_weight_has_the_posterior_of_its_integral_and_a_bound_below_its_evid
     assert abs(found.mean[0] - mean) < 0.2 * spread
     np.testing.assert_allclose(abs(found.root[0, 0]), spread, rtol=0.2)
     evidence = np.log(volume) + float(posterior._log_prior(found.hyper, PARTS))
-    assert evidence - 0.3 < found.bound < evidence + 0.01
+    assert evidence - 0.3 < found.bound < evidence + 0.02
 
 
 def test_a_hypothesis_without_a_finite_posterior_stays_as_it_was():
     data, zero, one = answered(), jnp.zeros(()), jnp.ones(1)
     frame = ObservationFrame(jnp.zeros(1), one, one, one, jnp.zeros(0, int))
-    hyper = Hyper(jnp.zeros(1), jnp.zeros(1), jnp.zeros(1), zero + 60, zero, jnp.zeros(1), zero, zero, 0)
+    hyper = Hyper(jnp.zeros(1), jnp.zeros(1), jnp.zeros(1), zero + 60, zero, jnp.zeros(1), zero, zero, zero, 0)
     change = Change(0.3 * one, jnp.zeros((0, 0)), jnp.zeros(1), jnp.zeros((1, 0)))
     alone = data, fitting.Hypothesis(ModelParts(one, True), change, hyper), posterior.unread(data, hyper)
     rows, hypothesis, before = jax.tree.map(lambda leaf: leaf[None], alone)
