@@ -65,12 +65,7 @@ def _of_arm(skill: str, script: str, scenario: str) -> Film:
 FILMS = (
     Film(
         "billiards",
-        make=(
-            (
-                "billiards",
-                "sweep billiards --preset quickstart --seeds 2002:2003 --schedule.total-steps 600",
-            ),
-        ),
+        make=(("billiards", "sweep billiards --preset quickstart --seeds 2002:2003 --schedule.total-steps 600"),),
         before="WORK/billiards --guidance none --steps 3",
         after="WORK/billiards --guidance relative --steps 3",
         words=("600 shots, no labels", "600 shots, 100 labels"),

@@ -80,10 +80,7 @@ EXPERIMENT = Experiment(
     "navigation",
     PIECES,
     SCALES,
-    report={
-        "clutter": ("--level", "0.9", "--reference", "relative"),
-        "long": ("--level", "0.9"),
-    },
+    report={"clutter": ("--level", "0.9", "--reference", "relative"), "long": ("--level", "0.9")},
     metric=("--metric", "success"),
 )
 main = partial(run, EXPERIMENT, __doc__ or "")

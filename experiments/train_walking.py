@@ -201,9 +201,7 @@ def _ppo(config: Training, seed: int, look: Callable[[int, Any, Any], None]) -> 
         normalize_observations=True,
         max_grad_norm=config.max_grad_norm,
         network_factory=partial(
-            networks.make_ppo_networks,
-            policy_hidden_layer_sizes=config.layers,
-            value_hidden_layer_sizes=VALUE_LAYERS,
+            networks.make_ppo_networks, policy_hidden_layer_sizes=config.layers, value_hidden_layer_sizes=VALUE_LAYERS
         ),
         seed=seed,
         num_evals=config.measurements + 1,

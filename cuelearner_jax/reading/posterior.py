@@ -146,7 +146,7 @@ def _solve(hyper: Hyper, parts: ModelParts, data: Data, precision: Array, target
         prior = amplitudes(hyper)
         correlations = correlation(lengths(hyper), data.inputs, data.inputs)
         *whitened, logs = each_lane(partial(_whitened, correlations))(hx, hr, root, prior)
-    of_x, of_r, known = whitened
+    of_x, of_r, own = whitened
     inner = jnp.linalg.cholesky(jnp.eye(len(size)) + jnp.einsum("cnp,cnq->pq", hx, of_x))
     solve = partial(jax.scipy.linalg.solve_triangular, inner, lower=True)
     vector = solve(jnp.einsum("cnp,cn->p", hx, of_r))
@@ -155,7 +155,7 @@ def _solve(hyper: Hyper, parts: ModelParts, data: Data, precision: Array, target
     noise = jnp.where(root > 0, 1 / jnp.where(root > 0, root, 1.0), 0.0)  # none of what was not answered
     mean = data.offset + x @ weights + (noise * (hr - hx @ weights - rest)).T
     away = away - noise[:, :, None] * (hx - of_x)
-    variance = jnp.where(root > 0, known * noise**2, (prior**2)[:, None])
+    variance = jnp.where(root > 0, own * noise**2, (prior**2)[:, None])
     spread = (solve(away.reshape(-1, len(size)).T) ** 2).sum(0).reshape(away.shape[:2])
     log_z = -0.5 * (logs.sum() + 2 * jnp.log(jnp.diag(inner)).sum() + (hr * of_r).sum() - (vector**2).sum())
     covariance_root = size[:, None] * jax.scipy.linalg.solve_triangular(inner.T, jnp.eye(len(size)), lower=False)

@@ -62,10 +62,7 @@ def one_line(call, says):
     return refused.value
 
 
-FAULTS = {
-    "raised KeyError": KeyError("a\nb"),
-    "gave zero or not finite numbers in place of actions": [np.nan, 0.0],
-}
+FAULTS = {"raised KeyError": KeyError("a\nb"), "gave zero or not finite numbers in place of actions": [np.nan, 0.0]}
 
 
 @pytest.fixture(params=FAULTS)

@@ -22,8 +22,7 @@ def test_rotate_is_counterclockwise():
 
 
 @pytest.mark.parametrize(
-    ("start", "end", "turn"),
-    [(0, 30, 30), (30, 0, -30), (170, -170, 20), (-170, 170, -20), (45, 45, 0)],
+    ("start", "end", "turn"), [(0, 30, 30), (30, 0, -30), (170, -170, 20), (-170, 170, -20), (45, 45, 0)]
 )
 def test_difference_is_signed_and_wraps(start, end, turn):
     assert float(directions.difference(direction(start), direction(end))) / DEG == pytest.approx(turn, abs=1e-4)

@@ -124,11 +124,7 @@ def test_what_does_not_fit_is_told(changed, told, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text",
-    [
-        "\ufeffobservation,action.x,action.y\n1 2,3,4\n",
-        'action.x,action.y,observation\n3,4,"[1, 2]"\n',
-    ],
+    "text", ["\ufeffobservation,action.x,action.y\n1 2,3,4\n", 'action.x,action.y,observation\n3,4,"[1, 2]"\n']
 )
 def test_a_csv_file_of_any_program_is_read(text, tmp_path):
     (tmp_path / "situations.csv").write_text(text, encoding="utf-8")
@@ -139,11 +135,7 @@ def test_a_csv_file_of_any_program_is_read(text, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
-    [
-        ("../secret.png", "leads out of"),
-        ("notes.txt", "is no picture's file that the page shows"),
-    ],
+    ("name", "told"), [("../secret.png", "leads out of"), ("notes.txt", "is no picture's file that the page shows")]
 )
 def test_a_picture_that_cannot_be_shown_is_told_when_it_is_wanted(name, told, tmp_path):
     table(tmp_path / "there", **GOOD, picture=[name, None])

@@ -23,11 +23,7 @@ from cuelearner_envs.anymal.policy import WalkingPolicy, add_noise, observe
 
 HELD, SETTLING = 200, 100  # control steps for which a command is held, and how many of them are not yet settled
 STEPS = 1000  # of control that a robot walks: 20 s
-TRIALS = {
-    "clean": Trial(),
-    "disturbed": Trial(noise=1.0, push=0.5),
-    "varied": Trial(friction=(0.5, 1.25), payload=6.0),
-}
+TRIALS = {"clean": Trial(), "disturbed": Trial(noise=1.0, push=0.5), "varied": Trial(friction=(0.5, 1.25), payload=6.0)}
 
 
 def _choose(

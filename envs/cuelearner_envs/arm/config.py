@@ -58,8 +58,7 @@ def make_environment(config: ArmConfig, observation: Sequence[Quantity]) -> Arm:
     """Return the environment of a configuration; `observation`: names of its slices."""
     return Arm(
         camera=Camera(
-            turn=jnp.deg2rad(jnp.float32(config.camera_turn_deg)),
-            offset=jnp.array(config.camera_offset, jnp.float32),
+            turn=jnp.deg2rad(jnp.float32(config.camera_turn_deg)), offset=jnp.array(config.camera_offset, jnp.float32)
         ),
         ground=ArmGround(friction=jnp.float32(config.friction), post=jnp.float32(config.has_post)),
         grasps=jnp.float32(config.skill == "pick"),
