@@ -160,7 +160,8 @@ def _solve(hyper: Hyper, parts: ModelParts, data: Data, precision: Array, target
     log_z = -0.5 * (logs.sum() + 2 * jnp.log(jnp.diag(inner)).sum() + (hr * of_r).sum() - (vector**2).sum())
     covariance_root = size[:, None] * jax.scipy.linalg.solve_triangular(inner.T, jnp.eye(len(size)), lower=False)
     variance = jnp.maximum((variance + spread).T, 1e-8)
-    return _Solved(mean, variance, size * weights, covariance_root, (root * rest).T, log_z)
+    alpha = (root * rest).T if parts.process else jnp.zeros_like(residual)
+    return _Solved(mean, variance, size * weights, covariance_root, alpha, log_z)
 
 
 def _whitened(
