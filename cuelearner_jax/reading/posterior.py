@@ -173,7 +173,7 @@ def _whitened(
     of its determinant.
     """
     inverse, logs = _inverse(jnp.eye(len(root)) + amplitude**2 * root[:, None] * correlations * root[None])
-    return inverse @ hx, inverse @ hr, 1 - jnp.diag(inverse), logs
+    return _product(inverse, hx), _product(inverse, hr), 1 - jnp.diag(inverse), logs
 
 
 @jax.custom_vjp
