@@ -39,7 +39,7 @@ def spread(row: Measured, metric: str) -> Interval | None:
     each = row.each[metric][:1] if is_single(row) else row.each[metric]
     no_shares = ("reward", "return") if "return" in row.metrics else ()
     if metric not in no_shares and each.min() == each.max() and each.min() in (0, 1) and each.shape[-1] > 1:
-        return Interval(*map(np.asarray, extreme_share(each.min(), each.shape[-1])))
+        return Interval(*map(np.asarray, extreme_share(float(each.min()), each.shape[-1])))
     return Interval(*mean_interval(each[0])) if is_single(row) else interval(row.metrics[metric], group_means(each))
 
 
