@@ -193,7 +193,8 @@ def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = No
     if base is None:
         return Agreement(len(own), interval(own), interval(right))
     before = agreed(base)
-    return Agreement(len(own), *map(interval, (own, right, before)), interval(own - before, is_share=False))
+    change = interval(own - before, is_share=False)
+    return Agreement(len(own), interval(own), interval(right), interval(before), change)
 
 
 def _answers_of(policy: Any, rows: Label, space: Space, eps: float) -> Float[np.ndarray, "labels cues"]:
