@@ -48,6 +48,9 @@ def best_near_peaks(
     return each_in_portions(choose, obs, coarse + peaks * (2 * stride - 1))
 
 
-def each_in_portions(choose: Callable[[Array], ChoiceT], obs: Observations, looked: int) -> ChoiceT:
-    """Return a choice in each situation (leading axis n), with as many situations at once as memory allows."""
-    return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // looked)))
+def each_in_portions(choose: Callable[[Array], ChoiceT], obs: Observations, actions: int) -> ChoiceT:
+    """Return a choice among so many actions in each situation (leading axis n).
+
+    As many situations at once as memory allows.
+    """
+    return jax.lax.map(choose, obs, batch_size=max(1, min(len(obs), portions().actions // actions)))

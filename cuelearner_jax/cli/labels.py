@@ -108,8 +108,7 @@ def _facts(file: LabelFile) -> dict[str, str]:
         facts |= {"fitted meanwhile": str(of("guidance")), "seed": str(of("seed"))}
     if file.people is not None:
         seconds = np.asarray(file.people.seconds, float)
-        spent = (file.counts or {}).get("seconds") or seconds.sum()  # also on answers that do not count
-        pace = f"{60 * len(seconds) / spent:.1f}" if spent > 0 else ""
+        pace = f"{60 * len(seconds) / file.seconds:.1f}" if file.seconds > 0 else ""
         facts |= {
             "by": ", ".join(f"{who} ({count})" for who, count in Counter(file.people.who.tolist()).items()),
             "given": f"{min(file.people.when)} to {max(file.people.when)}",

@@ -140,7 +140,7 @@ def _solve(hyper: Hyper, parts: ModelParts, data: Data, precision: Array, target
     residual, away = target - data.offset, jnp.moveaxis(x, 1, 0)  # (cues, n, p)
     root = jnp.sqrt(precision).T  # (cues, n)
     hx, hr = root[:, :, None] * away, root * residual.T
-    whitened = hx, hr, jnp.zeros_like(root)  # without the process the noise, in units of its own, is all there is
+    whitened = hx, hr, jnp.zeros_like(root)  # without the process there is noise alone, which is 1 in its own units
     logs, prior = jnp.zeros(()), jnp.zeros(residual.shape[1])
     if parts.process:
         prior = amplitudes(hyper)
@@ -183,7 +183,7 @@ def _inverse(whole: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Arr
     Their slopes are two products of matrices, where those of a Cholesky factor are several slow solutions.
     """
     factor = jnp.linalg.cholesky(whole)
-    root = _of_triangle(factor)
+    root = _inverse_of_triangle(factor)
     return _product(root.T, root), 2 * jnp.log(jnp.diag(factor)).sum()
 
 
@@ -196,12 +196,12 @@ _inverse.defvjp(lambda whole: (both := _inverse(whole), both[0]), _slopes)
 _product = partial(jnp.matmul, precision="highest")  # on a GPU too
 
 
-def _of_triangle(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def _inverse_of_triangle(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return the inverse of a lower triangle, by halves: products of matrices are the fastest there is."""
     half = len(factor) // 2
     if half < SMALL:
         return jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(factor)), lower=True)
-    first, last = _of_triangle(factor[:half, :half]), _of_triangle(factor[half:, half:])
+    first, last = _inverse_of_triangle(factor[:half, :half]), _inverse_of_triangle(factor[half:, half:])
     below = -_product(_product(last, factor[half:, :half]), first)
     return jnp.block([[first, jnp.zeros((half, len(last)))], [below, last]])
 

@@ -80,7 +80,8 @@ class LabelFile(NamedTuple):
     labels: Label  # rows (labels, ...) that still count, in the order they were given
     people: People | None = None  # None: the labels of a simulated teacher, or a merge that includes such labels
     session: dict[str, Any] | None = None  # settings of the page that asked, see `labelling.session`
-    counts: dict[str, float] | None = None  # of all rows: number of each kind in `RESPONSES`, and their "seconds"
+    counts: dict[str, int] | None = None  # number of rows of each kind in `RESPONSES`, all rows counted
+    seconds: float = 0.0  # what all rows took people [s]
 
     @property
     def budget(self) -> int:
@@ -173,9 +174,8 @@ def read(path: Path) -> LabelFile:
         raise UserError(f"no label file at {path}: give the path of a labels.parquet that a run or a person wrote")
     table, head = _table_and_head(file)
     try:
-        counts: Any = dict(Counter(table["said"].to_pylist())) if "item" in table.column_names else None
-        if counts:
-            counts["seconds"] = sum(filter(None, table["seconds"].to_pylist()))
+        counts = dict(Counter(table["said"].to_pylist())) if "item" in table.column_names else None
+        seconds = sum(filter(None, table["seconds"].to_pylist())) if counts else 0.0
         table = _standing(table) if counts else table
         if head is None or not table.num_rows:
             raise UserError(f"{file} holds no labels: collect some first")
@@ -186,7 +186,7 @@ def read(path: Path) -> LabelFile:
         people = People(*(columns[name] for name in People._fields)) if counts else None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise formats.damage_error("labels", file, error) from error
-    rest = {"people": people, "session": head.get("session"), "counts": counts}
+    rest = {"people": people, "session": head.get("session"), "counts": counts, "seconds": seconds}
     return LabelFile(**about, eps=eps, seeds=columns["seed"], labels=labels, **rest)
 
 

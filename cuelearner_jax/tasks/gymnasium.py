@@ -277,9 +277,9 @@ def _with_names(
         raise UserError("observation has an origin or a slice to follow: leave both out, and give adapt the changes=")
     if total != size:
         raise UserError(f"observation names {total} entries, and {name} has {size}: name each entry once")
-    sizes, own_sizes = ([(one.name, one.size) for one in row] for row in (slices, own))
-    if sizes != own_sizes and {*dict(sizes)} == {*dict(own_sizes)}:
-        raise UserError(f"observation is in another order or size than {name}'s vector, {sizes}: give these in order")
+    vector, order = ([(one.name, one.size) for one in row] for row in (slices, own))
+    if vector != order and {*dict(vector)} == {*dict(order)}:
+        raise UserError(f"observation is in another order or size than {name}'s vector, {vector}: give these in order")
     if unknown := sorted(set(units) - {quantity.name for quantity in own}):
         there = ", ".join(quantity.name for quantity in own)
         raise UserError(f"units names {unknown[0]!r}, the slices are {there}: name one of them")

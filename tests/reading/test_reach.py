@@ -88,8 +88,8 @@ def test_a_change_is_corrected_and_its_interval_holds_the_truth(right, truth, aw
     assert error(reading.act, right, away=away) < 0.1 * error(policy, right, away=away)
     found = {one.name: one for one in result.estimates}
     assert found.keys() == truth.keys()
-    for name, value in truth.items():  # at its bounds a policy leaves shifts a little uncertain
-        assert found[name].low - 0.01 <= value <= found[name].high + 0.01, found[name].words()
+    for name, value in truth.items():
+        assert found[name].low <= value <= found[name].high, found[name].words()
 
 
 def test_entries_that_are_seen_mixed_are_told_as_such():

@@ -20,7 +20,7 @@ def said():
 
 
 def told(values, each=None):
-    """As the page writes a variant, with episodes' results where they are kept: 0.417 [0.400, 0.449]."""
+    """As the page writes a variant, with episodes' results where there are any: 0.417 [0.400, 0.449]."""
     mean, lower, upper = map(float, interval(np.asarray(values, float), each))
     return f"{mean:.3f} [{f'{lower:.3f}, {upper:.3f}' if lower < upper else 'no spread'}]"
 
