@@ -25,9 +25,9 @@ from _measuring import Timed
 from classic_control import TASKS
 
 import cuelearner_jax as cl
-from cuelearner_jax.bridges.brax import from_brax
 from cuelearner_jax.run_config import RunConfig
 from cuelearner_jax.storage.provenance import provenance
+from cuelearner_jax.tasks.simulators import playground_task
 
 LONGEST = 1000  # steps of the longest episode
 Tell = Callable[[dict[str, Any]], None]  # takes an evaluation: step, returns (seeds), seconds of the stretch before it
@@ -58,20 +58,19 @@ def evaluation(env: Any, functions: Any, episodes: int = 10) -> Callable[[Any], 
     return jax.jit(play)
 
 
-def environment(name: str, processes: int) -> Any:
+def environment(name: str, options: argparse.Namespace) -> Any:
     """Return a task of `classic_control.py`, MuJoCo Playground (`playground:NAME`) or Gymnasium."""
     if name in TASKS:
         return TASKS[name]
     if not name.startswith("playground:"):
-        return cl.from_gymnasium(name, processes=processes).env
-    from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
-
-    return from_brax(registry.load(name.removeprefix("playground:"), config_overrides={"impl": "jax"}))
+        return cl.from_gymnasium(name, processes=options.processes).env
+    task = playground_task(name.removeprefix("playground:"))
+    return task.environment(task.configure(overrides=tuple(options.overrides)))
 
 
 def train_here(name: str, config: RunConfig, options: argparse.Namespace, tell: Tell) -> None:
     """Train with this package's loop, that of `cuelearner sweep`, all seeds side by side."""
-    env = environment(name, options.processes)
+    env = environment(name, options)
     lanes = Timed(config, env, "none", options.seeds)
     returned = evaluation(env, config.agent_in(env), options.episodes)
     every = options.steps // options.evaluations
@@ -133,6 +132,7 @@ def parser_of(about: str | None, environments: list[str], ways: list[str], seeds
     parser.add_argument("--peer-python", default=sys.executable, help="a Python with the peers")
     parser.add_argument("--seeds", type=int, default=seeds)
     parser.add_argument("--at-once", type=int, default=1, help="seeds of a peer that run side by side (default: 1)")
+    parser.add_argument("--overrides", nargs="+", default=[], help="of Playground, as those of --task.overrides")
     parser.add_argument("--steps", type=int, default=500_000, help="of each training (default: 500,000)")
     parser.add_argument("--processes", type=int, default=1, help="that play our environments (default: 1)")
     parser.add_argument("--evaluations", type=int, default=5, help="of each training (default: 5)")
@@ -157,7 +157,7 @@ def compare(
         raise SystemExit("give at least two evaluations that divide --steps, each a multiple of --envs")
     rows = json.loads(options.out.read_text())["rows"] if options.out and options.out.exists() else []
     rows = [row for row in rows if len(row["rows"]) == options.evaluations]
-    setting |= {name: getattr(options, name) for name in ("steps", "evaluations", "episodes")}
+    setting |= {name: getattr(options, name) for name in ("steps", "evaluations", "episodes", "overrides")}
     for name in options.environments:
         for way in options.ways:
             if any((row["environment"], row["way"]) == (name, way) for row in rows):
