@@ -11,6 +11,7 @@ has is in `Environment`. It may also have these members; no module asks for the 
 | symmetries             | number of exact symmetries for data augmentation; ask by `symmetries_of`                 |
 | mirror(which, obs, v)  | images of an observation and an action-like vector under symmetry `which`; 0: itself     |
 | features(obs, actions) | `Features`: a network's inputs for one observation and each of the actions               |
+| privileged             | entries at the end of `remember` and `Step.aftermath` that only critics see, with obs    |
 | aims(obs)              | `Aims`: one for each thing that an action may be about, in a fixed order                 |
 | plays_once             | True: an evaluation plays one episode in each, since steps are slow; NaN is no action    |
 """
@@ -242,11 +243,12 @@ class Spaces(NamedTuple):
     actions: Space
     features: tuple[int, int] | None = None  # entries of `Features.own` and `Features.turned`, if it offers any
     aims: int | None = None  # entries of one row of `Aims.features`, if it offers any
+    privileged: int = 0  # entries that critics see beside an observation
 
 
 def spaces_of(env: Any) -> Spaces:
     """Return an environment's spaces; shapes in place of its arrays will do."""
-    spaces = Spaces(env.obs_size, actions_of(env))
+    spaces = Spaces(env.obs_size, actions_of(env), privileged=getattr(env, "privileged", 0))
     obs, action = jnp.zeros(spaces.obs_size), jnp.zeros(spaces.actions.size)
     features, aims = _traced(_classes(jax.tree.structure(env)))
     if offers(env, "features"):

@@ -40,6 +40,8 @@ class Transition(struct.PyTreeNode):
     # discount of the value of `next_obs`: 0 at termination, never at truncation; 1 after one step
     discount: Float[Array, ""]
     next_obs: Float[Array, " obs_or_0"]
+    # what critics see beside the two observations; None: nothing, or a transition of several steps
+    privileged: tuple[Float[Array, " privileged"], Float[Array, " privileged_or_0"]] | None = None
 
 
 class LaterSteps(NamedTuple):
@@ -176,7 +178,9 @@ class Memory(NamedTuple):
             discount = stored.discount[:, 0]
         else:
             next_obs, discount = jnp.zeros((stored.reward.shape[0], 0)), jnp.zeros_like(stored.reward)
-        return Transition(jax.vmap(self.env.recall)(stored.obs), stored.action, stored.reward, discount, next_obs)
+        count, obs = getattr(self.env, "privileged", 0), jax.vmap(self.env.recall)(stored.obs)
+        privileged = (stored.obs[:, -count:], stored.aftermath[:, -count:]) if count else None
+        return Transition(obs, stored.action, stored.reward, discount, next_obs, privileged)
 
     def n_step(self, numbers: Int[Array, " batch"], n: int, discount: Number) -> Transition:
         """Return the transitions that begin at rows `numbers` and span up to n steps of one episode."""

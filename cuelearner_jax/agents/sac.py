@@ -150,8 +150,8 @@ class SoftActorCritic:
         """Return random parameters, target critics that are copies, and the first temperature."""
         own, space = self.options, self.spaces.actions
         k_actor, k_critics = jax.random.split(key)
-        obs, action = jnp.zeros(self.spaces.obs_size), jnp.zeros(space.size)
-        actor = self._actor.init(k_actor, obs)
+        obs, action = jnp.zeros(self._critic_inputs), jnp.zeros(space.size)
+        actor = self._actor.init(k_actor, obs[: self.spaces.obs_size])
         first = self._critic.start if isinstance(self._critic, CategoricalCritic) else self._critic.init
         critics = jax.vmap(lambda k: first(k, obs, action))(jax.random.split(k_critics, own.critics))
         log_temperature = jnp.zeros(())
@@ -164,11 +164,11 @@ class SoftActorCritic:
 
     def act(self, env: Any, params: Params, obs: Observations, key: PRNGKeyArray) -> Actions:
         """Return the squashed mean of the Gaussian."""
-        return self.in_box(jnp.tanh(self._gaussian(params["actor"], normalised(obs, params.get("obs")))[0]))
+        return self.in_box(jnp.tanh(self._gaussian(params["actor"], self._normalised(params, obs))[0]))
 
     def explore(self, env: Any, options: SACConfig, params: Params, obs: Observations, key: PRNGKeyArray) -> Actions:
         """Return actions drawn from the squashed Gaussian."""
-        return self.in_box(self.draw(params["actor"], normalised(obs, params.get("obs")), key).unit)
+        return self.in_box(self.draw(params["actor"], self._normalised(params, obs), key).unit)
 
     def in_unit(self, actions: Float[Array, "*n action"]) -> Float[Array, "*n action"]:
         """Return actions of the box in unit coordinates."""
@@ -217,6 +217,10 @@ class SoftActorCritic:
             (critics, opt_state, target_critics, moments, _), (key, number) = carry, own_key
             k_batch, k_target = jax.random.split(key)
             (batch,) = memory.batches(k_batch, own.batch_size, guided_share=options.guided_share)
+            if batch.privileged is not None:  # from here on observations are those of critics
+                pairs = zip((batch.obs, batch.next_obs), batch.privileged, strict=True)
+                obs, next_obs = (jnp.concatenate(pair, -1) for pair in pairs)
+                batch = batch.replace(obs=obs, next_obs=next_obs)
             if own.normalise_obs:
                 moments = next_moments(moments, batch.obs, number)
                 after = normalised(batch.next_obs, moments) if self.bootstraps else batch.next_obs
@@ -234,7 +238,7 @@ class SoftActorCritic:
                 target_critics = optax.incremental_update(critics, target_critics, options.polyak)
             return (critics, opt_state, target_critics, moments, batch.obs), (loss, optax.tree.norm(gradient))
 
-        none = jnp.zeros((own.batch_size, self.spaces.obs_size))
+        none = jnp.zeros((own.batch_size, self._critic_inputs))
         start = params["critics"], rest.critics_opt, rest.target_critics, params.get("obs"), none
         keys = jax.random.split(k_critics, own.updates_per_step)
         numbers = (count - 1) * own.updates_per_step + 1 + jnp.arange(own.updates_per_step)
@@ -327,8 +331,15 @@ class SoftActorCritic:
         return jax.tree.map(lambda leaf: leaf[subset], target_critics)
 
     def _gaussian(self, actor: Params, obs: Observations) -> tuple[Array, Array]:
-        mean, log_std = self._actor.apply(actor, obs)
+        mean, log_std = self._actor.apply(actor, obs[..., : self.spaces.obs_size])
         return jnp.asarray(mean), jnp.asarray(log_std)
+
+    def _normalised(self, params: Params, obs: Observations) -> Observations:
+        return normalised(obs, jax.tree.map(lambda leaf: leaf[: self.spaces.obs_size], params.get("obs")))
+
+    @property
+    def _critic_inputs(self) -> int:
+        return self.spaces.obs_size + self.spaces.privileged
 
     @property
     def _actor(self) -> Actor:

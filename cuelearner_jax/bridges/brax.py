@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity, WholeObservations
+from cuelearner_jax.environment import UNKNOWN_UNIT, Described, Quantity
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Box, Cue, Space, box
 from cuelearner_jax.types import Action, Observation, Step
@@ -32,7 +32,7 @@ class SimulatorState(struct.PyTreeNode):
     steps: Int[Array, ""]  # taken in this episode
 
 
-class JaxEnvironment(WholeObservations, struct.PyTreeNode):
+class JaxEnvironment(Described, struct.PyTreeNode):
     """A simulator as one of our environments (`cuelearner_jax.environment.Environment`).
 
     The simulator is a constant of what is compiled, `max_steps` is traced. The other fields, all that policies look
@@ -45,6 +45,7 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
     observation: tuple[Quantity, ...] = struct.field(pytree_node=False)
     actions: Space = struct.field(pytree_node=False)
     heuristic: Heuristic | None = struct.field(pytree_node=False, default=None)
+    privileged: int = struct.field(pytree_node=False, default=0)
 
     def reset(self, key: PRNGKeyArray) -> tuple[SimulatorState, Observation]:
         """Start an episode."""
@@ -62,8 +63,21 @@ class JaxEnvironment(WholeObservations, struct.PyTreeNode):
         final_obs, ended = flat(after.state.obs), terminated | truncated
         obs, reward = jnp.where(ended, fresh_obs, final_obs), after.state.reward.astype(jnp.float32)
         metrics = {name: jnp.asarray(value, jnp.float32) for name, value in after.state.metrics.items()}
-        step = Step(obs, final_obs, final_obs, reward, terminated, truncated, metrics, outcome={})
+        aftermath = self.remember(after, final_obs)
+        step = Step(obs, final_obs, aftermath, reward, terminated, truncated, metrics, outcome={})
         return jax.tree.map(partial(jnp.where, ended), fresh, after), step
+
+    def remember(self, state: SimulatorState, obs: Observation) -> Float[Array, " memory"]:
+        """Return the observation, and what critics alone see."""
+        return jnp.concatenate([obs, flat(state.state.obs[PRIVILEGED])]) if self.privileged else obs
+
+    def recall(self, memory: Float[Array, " memory"]) -> Observation:
+        """Return the observation."""
+        return memory[: self.obs_size]
+
+    def recall_next(self, memory: Array, action: Action, aftermath: Float[Array, " memory"]) -> Observation:
+        """Return the next observation."""
+        return aftermath[: self.obs_size]
 
 
 class FixedSimulator(NamedTuple):
@@ -80,6 +94,7 @@ class Interface(NamedTuple):
 
     observation: tuple[Quantity, ...]
     entries: tuple[str, ...]  # names of an action's entries
+    privileged: int = 0  # numbers that critics alone see
 
     def box(self, cues: Sequence[Cue] = ()) -> Box:
         """Return the space [-1, 1]^n of the actions, with a cue an entry: `cues`, or the entry's name."""
@@ -100,7 +115,9 @@ def layout_of(simulator: Any, name: str) -> Interface:
         if len(shape) > 1 or part.startswith("pixels"):
             raise UserError(f"{name}: the observation {part!r} is an image {shape}: give numbers (n,), as its state")
     observation = tuple(Quantity(part, math.prod(shape), UNKNOWN_UNIT) for part, shape in slices)
-    return Interface(observation, _entries_of(simulator, int(simulator.action_size)))
+    entries, whole = _entries_of(simulator, int(simulator.action_size)), jax.tree.leaves(shapes.obs)
+    privileged = sum(math.prod(leaf.shape) for leaf in whole) - sum(part.size for part in observation)
+    return Interface(observation, entries, privileged)
 
 
 def flat(obs: Array | Mapping[str, Any]) -> Observation:
@@ -110,7 +127,7 @@ def flat(obs: Array | Mapping[str, Any]) -> Observation:
 
 
 def _without_privileged(obs: Any) -> Any:
-    """Return an observation without what Playground gives to critics alone, since a real robot lacks it."""
+    """Return an observation without what critics alone see, since a real robot lacks it."""
     return {name: part for name, part in obs.items() if name != PRIVILEGED} if isinstance(obs, Mapping) else obs
 
 
@@ -145,4 +162,5 @@ def from_brax(
         cues: one an entry of the box (default: the entry's name in the model, else its number, "more" and "less").
     """
     layout, steps = layout_of(env, type(getattr(env, "unwrapped", env)).__name__), jnp.array(max_steps, jnp.int32)
-    return JaxEnvironment(steps, FixedSimulator(env), layout.observation, layout.box(cues), heuristic)
+    observation, actions = layout.observation, layout.box(cues)
+    return JaxEnvironment(steps, FixedSimulator(env), observation, actions, heuristic, layout.privileged)

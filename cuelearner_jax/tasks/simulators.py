@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from cuelearner_jax.bridges.brax import Interface, JaxEnvironment, layout_of
-from cuelearner_jax.config import EPISODE, check_part
+from cuelearner_jax.config import EPISODE, Bounds, check_part
 from cuelearner_jax.environment import UNKNOWN_UNIT, Quantity
 from cuelearner_jax.errors import UserError, format_value, suggestion
 from cuelearner_jax.task import QUICKSTART, Body, Task
@@ -45,6 +45,8 @@ class SimulatorConfig:
     """Layout: numbers in each slice."""
     entries: tuple[str, ...] = ()
     """Layout: names of an action's entries, each from -1 to 1."""
+    privileged: Annotated[int, Bounds(0)] = 0
+    """Layout: numbers that critics alone see."""
 
 
 @dataclass(frozen=True)
@@ -136,9 +138,11 @@ def make_environment(family: str, config: Any, split: str = "training") -> JaxEn
             f"another one: name the task {family}:ENVIRONMENT, which fills them"
         )
     slices = zip(config.slices, config.slice_sizes, strict=True)
-    layout = Interface(tuple(Quantity(name, size, UNKNOWN_UNIT) for name, size in slices), config.entries)
+    observation = tuple(Quantity(name, size, UNKNOWN_UNIT) for name, size in slices)
+    layout = Interface(observation, config.entries, config.privileged)
     simulator = Simulator(family, config.environment, getattr(config, VARIANTS[family]), layout)
-    return JaxEnvironment(jnp.array(config.max_steps, jnp.int32), simulator, layout.observation, layout.box())
+    steps = jnp.array(config.max_steps, jnp.int32)
+    return JaxEnvironment(steps, simulator, observation, layout.box(), privileged=layout.privileged)
 
 
 def _family(name: str, about: str, physics: str, config: type) -> Task:
@@ -161,7 +165,7 @@ def _task_of(family: Task, name: str) -> Task:
     """Return the task of an environment with its whole box of actions. Raises UserError for an unknown name."""
     layout = _layout(family.name, name, getattr(family.config, VARIANTS[family.name]))
     names, sizes, *_ = zip(*layout.observation, strict=True)
-    config = family.config(name, slices=names, slice_sizes=sizes, entries=layout.entries)
+    config = family.config(name, 1000, names, sizes, layout.entries, layout.privileged)
     presets = read("other", config, layout.box())["presets"]
     presets[QUICKSTART] = quickstart(config, layout.box(), 10, 1_000, (128, 128), guidance=("none",), seeds=4)
     return dataclasses.replace(family, about=f"{family.name}'s {name}", default=config, presets=presets)

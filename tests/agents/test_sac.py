@@ -219,6 +219,49 @@ def test_at_discount_zero_targets_are_rewards():
     np.testing.assert_array_equal(found, batch.reward)
 
 
+class Dark(Walk):
+    """The walk, of which actors see the time alone and critics the place as well."""
+
+    observation, privileged = Walk.observation[1:], 1
+
+    def reset(self, key):
+        state, _ = super().reset(key)
+        return state, state[1:]
+
+    def step(self, key, state, action):
+        after, step = super().step(key, state, action)
+        return after, step.replace(obs=after[1:], final_obs=step.final_obs[1:], aftermath=step.final_obs[::-1])
+
+    def remember(self, state, obs):
+        return state[::-1]
+
+    def recall(self, memory):
+        return memory[:1]
+
+    def recall_next(self, memory, action, aftermath):
+        return aftermath[:1]
+
+
+def test_critics_alone_see_what_is_privileged():
+    env = Dark()
+    buffer, (state, obs) = buffer_for(env, True), jax.vmap(env.reset)(jax.random.split(KEY, 16))
+    _, step = jax.vmap(env.step)(jax.random.split(KEY, 16), state, BOX.sample(KEY, (16,)))
+    kept = jax.vmap(env.remember)(state, obs)
+    stored = jax.vmap(partial(stored_step, bootstraps=True))(kept, BOX.sample(KEY, (16,)), step)
+    of = Memory(env, buffer, buffer.add(buffer.empty(96), jnp.array(0), stored), jnp.array(16), 16, True)
+    (batch,) = of.batches(KEY, 8)
+    assert (batch.obs.shape, batch.next_obs.shape) == ((8, 1), (8, 1))
+    np.testing.assert_allclose(batch.reward, -jnp.abs(batch.privileged[1][:, 0]))  # the walk pays for its next place
+
+    agent = dataclasses.replace(SMALL, normalise_obs=True).make("raw", spaces_of(env), True)
+    before, scalars = agent.init(KEY), dataclasses.replace(probes.SCALARS, discount=0.9)
+    params, *_ = agent.update(env, agent.options, scalars, jnp.array(1), *before, of, KEY)
+    assert params["obs"]["mean"][1] != 0  # the place, beside the time, which is 0 in first steps
+    inputs = {name: params[name]["params"]["Dense_0"]["kernel"].shape[-2] for name in ("actor", "critics")}
+    assert inputs == {"actor": 1, "critics": 2 + BOX.size}
+    assert agent.act(env, params, obs, KEY).shape == (16, 2)
+
+
 # Normalised observations.
 
 

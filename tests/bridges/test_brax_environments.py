@@ -8,7 +8,7 @@ from brax import envs
 from brax.envs.wrappers import training
 
 from cuelearner_jax.bridges.brax import from_brax
-from cuelearner_jax.environment import Environment, symmetries_of
+from cuelearner_jax.environment import Environment, spaces_of, symmetries_of
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.spaces import Box, Cue
 
@@ -88,7 +88,7 @@ def test_actions_are_the_whole_box_with_names_of_the_model_or_cues_of_the_caller
     assert [cue.name for cue in named.cues] == ["bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot"]
 
 
-def test_observations_in_a_dictionary_are_one_vector_with_named_slices_but_those_for_critics():
+def test_observations_in_a_dictionary_are_one_vector_with_named_slices_and_those_for_critics_apart():
     class Parts(Field):
         def reset(self, rng):
             state = super().reset(rng)
@@ -104,7 +104,13 @@ def test_observations_in_a_dictionary_are_one_vector_with_named_slices_but_those
     np.testing.assert_array_equal(whole, start[[0, 0, 1]])
     for one, other in zip(steps, expected, strict=True):
         np.testing.assert_array_equal(one.obs, other.obs[[0, 0, 1]])
-        np.testing.assert_array_equal(one.aftermath, other.aftermath[[0, 0, 1]])
+        np.testing.assert_array_equal(one.aftermath, other.aftermath[[0, 0, 1, 0, 1]])
+        memory = jnp.asarray(one.aftermath)
+        np.testing.assert_array_equal(env.recall_next(memory, jnp.zeros(2), memory), one.final_obs)
+    assert spaces_of(env).privileged == 2
+    state, obs = env.reset(jax.random.key(1))
+    np.testing.assert_array_equal(env.remember(state, obs), start[[0, 0, 1, 0, 1]])
+    np.testing.assert_array_equal(env.recall(env.remember(state, obs)), obs)
 
 
 @pytest.mark.parametrize(
