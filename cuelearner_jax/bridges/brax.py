@@ -153,7 +153,7 @@ def from_brax(
     """Return an environment of brax or MuJoCo Playground as one of ours, with its whole box [-1, 1]^n of actions.
 
     `env` becomes a constant of what is compiled, `max_steps` is traced. Observations in a dictionary become one vector,
-    with a slice for each entry of the dictionary, in the order of their names, without Playground's `privileged_state`.
+    with a slice for each entry of the dictionary, in the order of their names. Critics alone see `privileged_state`.
 
     Args:
         env: bare, or in brax's `EpisodeWrapper`, whose truncations are then truncations here.
