@@ -5,7 +5,7 @@ Nobody answers here, so kinds of guidance that ask a teacher are refused; the ob
 leans, can guide. Run in the folder above this one:
 
     cuelearner train examples.brax_task:TASK --guidance heuristic --out runs/pendulum
-    cuelearner evaluate runs/pendulum --task examples.brax_task:TASK --envs 10 --steps 2000
+    cuelearner evaluate runs/pendulum --task examples.brax_task:TASK --episodes 10
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ TASK = Task(
     about="brax's inverted pendulum: a push a step keeps the pole up",
     config=PendulumConfig,
     bodies=(Body("cart", "brax's own", make_environment),),
+    longest=lambda config: config.max_steps,
     presets={
         "quickstart": Preset(
             "small networks: a minute or two on two CPU cores",

@@ -30,6 +30,7 @@ class SimulatorState(struct.PyTreeNode):
 
     state: Any  # the simulator's state
     steps: Int[Array, ""]  # taken in this episode
+    total: Float[Array, ""]  # rewards of this episode
 
 
 class JaxEnvironment(Described, struct.PyTreeNode):
@@ -50,21 +51,23 @@ class JaxEnvironment(Described, struct.PyTreeNode):
     def reset(self, key: PRNGKeyArray) -> tuple[SimulatorState, Observation]:
         """Start an episode."""
         state = jax.tree.map(jnp.asarray, self.simulator().reset(jax.random.key_data(key)))
-        return SimulatorState(state, jnp.zeros((), jnp.int32)), flat(state.obs)
+        return SimulatorState(state, jnp.zeros((), jnp.int32), jnp.zeros(())), flat(state.obs)
 
     def step(self, key: PRNGKeyArray, state: SimulatorState, action: Action) -> tuple[SimulatorState, Step]:
         """Step the simulator, then reset it if that was the end. `key` is the reset's: simulators' steps take none."""
         before = jax.tree.map(lambda leaf: leaf, state.state)  # simulators write into their input dictionaries
-        after = SimulatorState(jax.tree.map(jnp.asarray, self.simulator().step(before, action)), state.steps + 1)
+        result = jax.tree.map(jnp.asarray, self.simulator().step(before, action))
+        reward = result.reward.astype(jnp.float32)
+        after = SimulatorState(result, state.steps + 1, state.total + reward)
         stopped = jnp.asarray(after.state.info.get("truncation", 0)) > 0
         terminated = (after.state.done > 0) & ~stopped
         truncated = (stopped | (after.steps >= self.max_steps)) & ~terminated
         fresh, fresh_obs = self.reset(key)
         final_obs, ended = flat(after.state.obs), terminated | truncated
-        obs, reward = jnp.where(ended, fresh_obs, final_obs), after.state.reward.astype(jnp.float32)
+        obs, outcome = jnp.where(ended, fresh_obs, final_obs), {"return": after.total}
         metrics = {name: jnp.asarray(value, jnp.float32) for name, value in after.state.metrics.items()}
         aftermath = self.remember(after, final_obs)
-        step = Step(obs, final_obs, aftermath, reward, terminated, truncated, metrics, outcome={})
+        step = Step(obs, final_obs, aftermath, reward, terminated, truncated, metrics, outcome)
         return jax.tree.map(partial(jnp.where, ended), fresh, after), step
 
     def remember(self, state: SimulatorState, obs: Observation) -> Float[Array, " memory"]:

@@ -215,7 +215,7 @@ def task_from(
     _ = config.observation  # raises for units or kinds that do not fit
     lanes: dict[str, Any] = {"guidance": ("none", "relative"), "labels": (100,), "seeds": 1}
     several = min(num_envs, max(1, FIRST_EPISODES // config.max_steps))
-    preset = quickstart(config, config.space, several, 10 * config.max_steps, (64, 64), **lanes)
+    preset = quickstart(config, config.space, several, 10, (64, 64), **lanes)
     changes: dict[str, Any] = {"default": config, "bodies": (_body(factory),), "presets": {QUICKSTART: preset}}
     return dataclasses.replace(GYMNASIUM, about=f"Gymnasium's {name}", **changes)
 

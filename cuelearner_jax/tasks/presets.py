@@ -57,16 +57,20 @@ def _replace(start: Any, values: dict[str, Any]) -> Any:
 
 
 def quickstart(
-    config: Any, space: Space, num_envs: int, eval_steps: int, layers: tuple[int, ...], **lanes: Any
+    config: Any, space: Space, num_envs: int, episodes: int, layers: tuple[int, ...], **lanes: Any
 ) -> Preset:
-    """Return a preset of minutes for an environment of another library; `lanes`: fields of the preset."""
+    """Return a preset of minutes for an environment of another library, with so many `episodes` an evaluation.
+
+    `lanes`: fields of the preset.
+    """
     start = read("other", config, space)["presets"][QUICKSTART].config
     every = num_envs * -(-1_000 // num_envs)  # the first multiple from 1,000 on
-    counts = {"total_steps": 6 * every, "guidance_until": 3 * every, "eval_every": every, "checkpoint_every": 2 * every}
+    counts = {"eval_every": every, "eval_envs": episodes, "eval_steps": episodes * config.max_steps}
+    counts |= {"total_steps": 6 * every, "guidance_until": 3 * every, "checkpoint_every": 2 * every}
     run = dataclasses.replace(
         start,
         sizes=dataclasses.replace(start.sizes, num_envs=num_envs, feedback_layers=layers),
-        schedule=dataclasses.replace(start.schedule, eval_steps=eval_steps, **counts),
+        schedule=dataclasses.replace(start.schedule, **counts),
         agent=dataclasses.replace(start.agent, replay_capacity=num_envs * -(-50_000 // num_envs)),
     )
     return Preset(f"small networks, {6 * every:,} steps a seed", run, **lanes)

@@ -149,7 +149,15 @@ def make_environment(family: str, config: Any, split: str = "training") -> JaxEn
 def _family(name: str, about: str, physics: str, config: type) -> Task:
     pictures = partial(resolve_name, "cuelearner_jax.tasks.frames:SIMULATOR")  # takes seconds to load
     body = Body(name, physics, partial(make_environment, name), pictures=pictures)
-    return Task(name, f"{about} for instance", config, (body,), labels_hold=("max_steps", VARIANTS[name]))
+    return Task(
+        name,
+        f"{about} for instance",
+        config,
+        (body,),
+        longest=lambda config: config.max_steps,
+        judge_by=lambda config: "return",
+        labels_hold=("max_steps", VARIANTS[name]),
+    )
 
 
 # A label depends on one observation only.
@@ -168,7 +176,7 @@ def _task_of(family: Task, name: str) -> Task:
     names, sizes, *_ = zip(*layout.observation, strict=True)
     config = family.config(name, 1000, names, sizes, layout.entries, layout.privileged)
     presets = read("other", config, layout.box())["presets"]
-    presets[QUICKSTART] = quickstart(config, layout.box(), 10, 1_000, (128, 128), guidance=("none",), seeds=4)
+    presets[QUICKSTART] = quickstart(config, layout.box(), 10, 2, (128, 128), guidance=("none",), seeds=4)
     return dataclasses.replace(family, about=f"{family.name}'s {name}", default=config, presets=presets)
 
 

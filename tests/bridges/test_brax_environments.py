@@ -60,9 +60,10 @@ def test_a_step_is_that_of_brax():
     fresh = env.reset(jax.random.key(1))[1]  # the step's own key
     np.testing.assert_array_equal(steps[1].obs, fresh)
     np.testing.assert_allclose(steps[2].final_obs, fresh + np.array([0.5, 0]))
-    for step in steps:
-        assert (step.reward, step.reward.dtype) == (step.final_obs[0], np.float32)
-        assert step.outcome == {}
+    rewards = [step.final_obs[0] for step in steps]
+    returns = [rewards[0], rewards[0] + rewards[1], rewards[2], rewards[2] + rewards[3]]
+    for step, reward, total in zip(steps, rewards, returns, strict=True):
+        assert (step.reward, step.reward.dtype, step.outcome) == (reward, np.float32, {"return": total})
         np.testing.assert_allclose(step.metrics["length"], np.linalg.norm(step.final_obs))
         np.testing.assert_array_equal(step.aftermath, step.final_obs)
 

@@ -33,13 +33,13 @@ ROOT = Path(__file__).resolve().parents[2]
 TINY = shlex.split("""
     --agent.q-layers 8 --sizes.feedback-layers 8 --agent.directions 6 --agent.target-directions 6 --sizes.fit-steps 20
     --sizes.labels-per-round 5 --schedule.total-steps 40 --schedule.random-steps 10 --schedule.learn-after 10
-    --schedule.guidance-until 20 --schedule.eval-every 20 --schedule.eval-steps 160 --schedule.eval-envs 4
+    --schedule.guidance-until 20 --schedule.eval-every 20 --schedule.eval-steps 800 --schedule.eval-envs 4
     --schedule.checkpoint-every 40
 """)
 SMALL = {
     "train": [*TINY, "--labels", "5"],
     "sweep": [*TINY, "--labels", "5", "--seeds", "2"],
-    "evaluate": ["--steps", "160", "--envs", "4"],
+    "evaluate": ["--episodes", "4"],
     "render": ["--steps", "2"],
     "report": [],
 }
