@@ -40,7 +40,7 @@ class Transition(struct.PyTreeNode):
     # discount of the value of `next_obs`: 0 at termination, never at truncation; 1 after one step
     discount: Float[Array, ""]
     next_obs: Float[Array, " obs_or_0"]
-    # what critics see beside the two observations; None: nothing, or a transition of several steps
+    # what critics see beside the two observations; None: nothing
     privileged: tuple[Float[Array, " privileged"], Float[Array, " privileged_or_0"]] | None = None
 
 
@@ -187,10 +187,10 @@ class Memory(NamedTuple):
         after = self.buffer.follow(self.rows, self.filled, numbers, n, self.num_envs)
         summed = jax.vmap(partial(n_step_return, discount=discount))
         reward, factor, last = summed(after.rewards, after.discounts, after.ended, after.exists)
-        first = self.buffer.read(self.rows, numbers)
-        end = self.buffer.read(self.rows, jnp.mod(numbers + last * self.num_envs, self.rows.shape[0]))
-        next_obs = jax.vmap(self.env.recall_next)(end.obs, end.action, end.aftermath)
-        return Transition(jax.vmap(self.env.recall)(first.obs), first.action, reward, factor, next_obs)
+        ends = jnp.mod(numbers + last * self.num_envs, self.rows.shape[0])
+        first, end = (self.one_step(self.buffer.read(self.rows, rows)) for rows in (numbers, ends))
+        privileged = first.privileged and end.privileged and (first.privileged[0], end.privileged[1])
+        return first.replace(reward=reward, discount=factor, next_obs=end.next_obs, privileged=privileged)
 
 
 def count_guided(
@@ -278,7 +278,9 @@ def stored_step(obs: Float[Array, " memory"], action: Action, step: Step, bootst
 
 
 def apply_symmetries(key: PRNGKeyArray, env: Environment, batch: Transition) -> Transition:
-    """Return each transition of a batch under a random symmetry of the environment."""
+    """Return each transition of a batch under a random symmetry of the environment, unless critics see more."""
+    if batch.privileged is not None:  # nobody says how that is mirrored
+        return batch
     image = random_symmetries(key, env, batch.reward.shape[0])
     obs, action = image(batch.obs, batch.action)
     next_obs = image(batch.next_obs, batch.action)[0] if batch.next_obs.shape[-1] else batch.next_obs

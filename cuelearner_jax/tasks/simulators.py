@@ -75,8 +75,8 @@ class Simulator(NamedTuple):
 
     def __call__(self) -> Any:
         """Return the simulator. Raises UserError if its library has none, or one of another layout."""
-        # Runs before had no privileged part.
-        if _layout(self.family, self.environment, self.variant)[:2] != self.layout[:2]:
+        own = _layout(self.family, self.environment, self.variant)
+        if self.layout not in (own, own._replace(privileged=0)):  # runs before had no privileged part
             raise UserError(
                 f"{self.family}:{self.environment} has other observations or actions than its configuration: name the "
                 f"task {self.family}:{self.environment}, and install the {self.family} of the policy"

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
-from cuelearner_jax.environment import Aims, Environment, actions_of, offers, symmetries_of
+from cuelearner_jax.environment import Aims, Environment, WholeObservations, actions_of, offers, symmetries_of
 from cuelearner_jax.runs.training import ambiguous_names
 from cuelearner_jax.testing.laws import Laws, shapes_of
 
@@ -54,6 +54,9 @@ def _check_shapes(laws: Laws, env: Environment) -> None:
     memory = jax.eval_shape(env.remember, state, obs)
     recalled = jax.eval_shape(env.recall, memory)
     following = jax.eval_shape(env.recall_next, memory, action, step.aftermath)
+    count = getattr(env, "privileged", 0) if isinstance(env, WholeObservations) else 0
+    whole = min(memory.size, step.aftermath.size) >= obs.size + count
+    laws.hold(whole, "`privileged` numbers are missing: append them to what `remember` returns and to `Step.aftermath`")
     observations = {"observation": obs, "Step.obs": step.obs, "Step.final_obs": step.final_obs}
     observations |= {"what `recall` gives": recalled, "what `recall_next` gives": following}
     flags = {"Step.terminated": step.terminated, "Step.truncated": step.truncated}

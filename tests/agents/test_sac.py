@@ -249,7 +249,8 @@ def test_critics_alone_see_what_is_privileged():
     kept = jax.vmap(env.remember)(state, obs)
     stored = jax.vmap(partial(stored_step, bootstraps=True))(kept, BOX.sample(KEY, (16,)), step)
     of = Memory(env, buffer, buffer.add(buffer.empty(96), jnp.array(0), stored), jnp.array(16), 16, True)
-    (batch,) = of.batches(KEY, 8)
+    batch, later = of.batches(KEY, 8, 2, 0.9)
+    jax.tree.map(np.testing.assert_array_equal, batch, later)  # no second step was taken
     assert (batch.obs.shape, batch.next_obs.shape) == ((8, 1), (8, 1))
     np.testing.assert_allclose(batch.reward, -jnp.abs(batch.privileged[1][:, 0]))  # the walk pays for its next place
 

@@ -81,6 +81,7 @@ ENVIRONMENTS = {
         other(recall_next=lambda self, memory, action, aftermath: memory + aftermath),
         "recall_next(remember(state, obs), action, aftermath) is not Step.final_obs",
     ),
+    "privileged": (other(privileged=2), "`privileged` numbers are missing: append them"),
     "own features": (
         other(features=lambda self, obs, action: Features(action.ravel()[:1], action)),
         "`features` hold values in `own` that depend on the action",
