@@ -132,7 +132,8 @@ def _defaults(
     adapts = policy is not None or task.proposed is not None
     usual = PROPOSED if task.proposed is not None else NEAR_AIMS if task.near_aims else UNIFORM
     request = AdaptRequest.of(task, config, ahead.scenario, ahead.guidance[0] if ahead.guidance else kind)
-    world = configuration.from_json(task.config, again.task) if again else request.task
+    here = {"path": task.plain().path} if task.name == logs.NAME else {}  # of the recording, wherever it lay before
+    world = configuration.from_json(task.config, again.task | here) if again else request.task
     scalars = _values(GuideScalars, (request if adapts else config).scalars)
     scalars |= {"eps_deg": again.eps} if again and again.eps is not None else {}
     return LabelOptions(
@@ -216,7 +217,7 @@ def _second(plan: SessionPlan, options: LabelOptions, path: Path) -> SessionPlan
         raise UserError("--again repeats another page's questions: leave out the policy, --seed and --bound-deg")
     world = file.task | {"robot": file.session.get("robot", ""), "answers": file.answers, "eps": file.eps}
     for name, value in (plan.world | {"robot": plan.robot, "answers": plan.form.name, "eps": plan.eps}).items():
-        if (before := world.get(name)) != value:
+        if name != "path" and (before := world.get(name)) != value:  # a recording may lie elsewhere
             raise UserError(f"{path} asked in a world with another {name} ({before!r}, not {value!r}): give the same")
     place = label_files.found_in(path)
     assert place is not None  # the file was read above
@@ -292,10 +293,11 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
     `config`: the preset's configuration.
     """
     name, out, policy = task.origin or task.command_name or task.name, str(options.out), options.policy
+    bound = [] if options.bound_deg is None else ["--bound-deg", f"{options.bound_deg:g}"]
     if options.again is not None:
         return shlex.join(["cuelearner", "labels", "inspect", str(options.again), out])
     if policy is None and options.questions == PROPOSED and _has_proposals(task, options.task):
-        return shlex.join(["cuelearner", "adapt", "--labels-from", out, "--out", f"policies/{Path(out).name}"])
+        return shlex.join(["cuelearner", "adapt", "--labels-from", out, *bound, "--out", f"policies/{Path(out).name}"])
     is_recorded = task.name == logs.NAME
     if is_recorded and guidances.resolve(options.guidance).form is not RELATIVE:  # no command adapts to these
         return shlex.join(["cuelearner", "labels", "inspect", out])
@@ -314,6 +316,7 @@ def _following(task: Task, preset: str, config: RunConfig, options: LabelOptions
         parts = {} if is_recorded else {"task": task.config}  # labels hold the world of a recording
     words += [word for option in again if (value := getattr(options, option)) for word in (f"--{option}", value)]
     words += ["--guidance", options.guidance, "--labels-from", out, "--labels", str(labels)]
+    words += [] if policy is None else bound
     for part, kind in parts.items():
         before, now = (_values(kind, getattr(of, part)) for of in (config, options))
         words += as_options(part, {field: value for field, value in now.items() if value != before[field]})

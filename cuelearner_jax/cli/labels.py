@@ -100,7 +100,7 @@ def _facts(file: LabelFile) -> dict[str, str]:
         names = {UNSAID: "not said"} if form.by_eps else {}
         values = form.values(file.space)
         facts["of each answer"] = ", ".join(f"{names.get(one, f'{one:g}')}: {counts.get(one, 0)}" for one in values)
-    if file.counts:
+    if file.counts and file.session:  # a merged file holds what stands alone
         facts |= {"not known": str(file.counts.get(UNSURE, 0)), "taken back": str(file.counts.get(UNDONE, 0))}
     if file.session:
         of = file.session.get
@@ -108,7 +108,7 @@ def _facts(file: LabelFile) -> dict[str, str]:
         facts |= {"fitted meanwhile": str(of("guidance")), "seed": str(of("seed"))}
     if file.people is not None:
         seconds = np.asarray(file.people.seconds, float)
-        pace = f"{60 * len(seconds) / file.seconds:.1f}" if file.seconds > 0 else ""
+        pace = f"{60 * len(seconds) / file.seconds:.1f}" if file.session and file.seconds > 0 else ""
         facts |= {
             "by": ", ".join(f"{who} ({count})" for who, count in Counter(file.people.who.tolist()).items()),
             "given": f"{min(file.people.when)} to {max(file.people.when)}",

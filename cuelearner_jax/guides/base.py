@@ -18,7 +18,15 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
-from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, silent_cues, squared_errors
+from cuelearner_jax.guides.fitting import (
+    Example,
+    GuideModel,
+    fit_model,
+    guide_model,
+    held_out,
+    silent_cues,
+    squared_errors,
+)
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.types import Action, Actions, GuidanceModel, Label, Observation, Observations, Params
@@ -50,6 +58,7 @@ class Guide:
     sees_base: ClassVar[bool] = False  # True if it needs a finished policy's actions; it then serves adaptation only
     compares: ClassVar[bool] = False  # True if labels tell its outputs' differences between actions alone
     by_cues: ClassVar[bool] = False  # True if its model measures along cues, whatever its answers say
+    holds_out: ClassVar[bool] = True  # False if it learns every label, and none is held out for validation
     by_evidence: ClassVar[bool] = False  # True if `reading` reads its answers; it then serves adaptation only
     # From the above: whether it asks a teacher, needs a space with cues, corrects finished policies only
     asks: ClassVar[bool]
@@ -115,7 +124,8 @@ class Guide:
             return rows
         cues = is_answered(labels.answer)
         valid = labels.valid & cues.any(-1)
-        return rows.replace(valid=valid, cues=cues | silent_cues(labels.answer, valid))
+        learned = valid & ~held_out(len(valid)) if self.holds_out else valid
+        return rows.replace(valid=valid, cues=cues | silent_cues(labels.answer, learned))
 
     def augmented(self, key: PRNGKeyArray, batch: Any) -> Any:
         """Return the batch to train on in place of a batch (n, ...) of examples."""

@@ -12,7 +12,8 @@ labels (s, a, h), h_c in {-1, 0, 1} or not said of each cue c:
     a <- clip(retract(pi(s)), a, tau_max)
 
 A new label is in a minibatch of H, then in one of the policy, with its own target exp(a, eps h). `BATCH_STEPS` times
-`HUMAN_STEPS` minibatches of H and one of the policy follow (3 to 1, as in that code).
+`HUMAN_STEPS` minibatches of H and one of the policy follow (3 to 1, as in that code). Where a bound of actions cuts
+exp(a, eps h) short, h is as much smaller for H.
 
 What differs, and why: that code takes 500 such turns at the end of an episode, of which it may have many corrections or
 one; here each label has its turns, since rounds of questions are no episodes. "Already right" is an answer here, on

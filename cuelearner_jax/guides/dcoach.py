@@ -57,7 +57,7 @@ class DeepCoach(Demonstration):
     """A guide that acts as a cloned policy does, and is updated by each correction."""
 
     name, about, title = "dcoach", "a policy moved by each correction", "deep COACH"
-    form, colour = RELATIVE, "#56B4E9"
+    form, colour, holds_out = RELATIVE, "#56B4E9", False
     learners: ClassVar[tuple[str, ...]] = ("policy",)  # the networks of `Coached`
 
     @cached_property

@@ -45,6 +45,8 @@ def with_teacher(
     form = form_of(file)
     if form is None or file.people is None or file.session is None:
         raise UserError("the teacher cannot be asked about this file: give a file that `cuelearner label` wrote")
+    if task.teacher is None:
+        raise UserError(f"{task.name} has no teacher to ask: give --task a task of your own that has one")
     config = from_json(task.config, file.task)
     task = task.on(str(file.session.get("robot", "")).partition(" ")[0] or None)
     tell(f"asking the teacher of {task.name} about {len(rows)} questions")
@@ -95,9 +97,11 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
     for file in files:
         if len(np.unique(file.seeds)) > 1:
             raise UserError("a file holds the labels of several seeds: merge files of one seed each")
-        for name in ("task", "answers", "space", "eps"):
-            if (other := getattr(file, name)) != (own := getattr(first, name)):
-                raise UserError(f"the files differ in {name} ({own}, {other}): merge only files that agree in it")
+        worlds = ({**one.task, "answers": one.answers, "space": one.space, "eps": one.eps} for one in (first, file))
+        own, other = ({**world, "path": ""} for world in worlds)  # a recording may lie elsewhere
+        for name in own | other:
+            if (before := own.get(name)) != (now := other.get(name)):
+                raise UserError(f"the files differ in {name} ({before}, {now}): merge only files that agree in it")
         if file.labels.obs.shape[1] != first.labels.obs.shape[1]:
             raise UserError("the files' observations differ in size: merge files of one world")
         people = (file.people.who.tolist(), file.people.when.tolist()) if file.people else ()

@@ -166,12 +166,12 @@ class Learner:
         labels = jax.tree.map(np.array, self._blank.labels)
         for slot, (obs, action, answer) in enumerate(rows):
             labels.obs[slot], labels.action[slot], labels.answer[slot], labels.valid[slot] = obs, action, answer, True
-        guide = self._blank.replace(labels=jax.tree.map(jnp.asarray, labels), model=self.newest.model)
+        guide = self._blank.replace(labels=jax.tree.map(jnp.asarray, labels))
         rounds = jnp.asarray(count // plan.config.sizes.labels_per_round, jnp.int32)
         model = jax.block_until_ready(self._fit(of.guidance, of.env, of.scalars, guide, self._key, rounds).model)
         if not all_finite(model):
             return self.newest._replace(labels=count, problem="the last fit diverged")
-        apart = labels.valid & held_out(len(labels.valid))
+        apart = labels.valid & held_out(len(labels.valid)) & of.guidance.holds_out
         predicted = np.asarray(answers(of, model, labels))[apart]
         quality = agreement(plan.form, actions_of(of.env), predicted, labels.answer[apart])
         return Fitted(model, count, self.newest.number + 1, quality if quality.count else None)

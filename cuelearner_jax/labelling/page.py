@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import html
 import json
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -72,7 +73,8 @@ class Page:
     def _button(self, control: Control, props: str = "") -> ui.button:
         """Make a button whose event names the control and the item on the screen."""
         with ui.button(color=None).props(props).classes(control.colour).mark(control.name) as button:
-            ui.html(f"{control.words}<span class=key>{control.first_key}</span>", sanitize=False)
+            words, key = html.escape(control.words), html.escape(control.first_key)
+            ui.html(f"{words}<span class=key>{key}</span>", sanitize=False)
         send = f"event => cue.send({json.dumps(control.name)}, {{clicks: event.detail}})"
         button.on("click", lambda event, name=control.name: self._heard(event, name), js_handler=send)
         return button
@@ -111,7 +113,9 @@ class Page:
             swatches |= {one.colour: one.words for one in turns}
             swatches["refined"] = "the corrected policy" if by_evidence else "the model's correction"
             for name, about in swatches.items():
-                ui.html(f'<span class=swatch style="background:var(--{name})"></span>{about}', sanitize=False)
+                ui.html(
+                    f'<span class=swatch style="background:var(--{name})"></span>{html.escape(about)}', sanitize=False
+                )
             ui.label(self.session.questions.pictures.legend).classes("text-caption")
         with ui.element("div").classes("tools"):
             names = [name for name in self.controls if name in ("undo", "help") or name.startswith("film")]

@@ -261,6 +261,6 @@ def arrow(sketch: Sketch, angle: float, name: str, longer: float = 1.0, key: str
     if key:  # the key at the tip names the answer: screen left and right are swapped where an arrow points down
         x, y = _point(sketch, angle, last + badge)
         disc = f'<circle cx="{x:.4f}" cy="{y:.4f}" r="{badge:.5f}" stroke-width="{0.8 * hair:.5f}"/>'
-        text = f'<text x="{x:.4f}" y="{y:.4f}" font-size="{1.6 * badge:.5f}">{key}</text>'
+        text = f'<text x="{x:.4f}" y="{y:.4f}" font-size="{1.6 * badge:.5f}">{html.escape(key)}</text>'
         parts.append(f'<g class="at-key">{disc}{text}</g>')
     return f'<g class="arrow {name}">{"".join(parts)}</g>'

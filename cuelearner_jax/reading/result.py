@@ -150,7 +150,7 @@ def _changes_of_observation(
         low, mid, high = sorted(step[first] * (value + NORMAL * deviation * SIDES))
         if family and unknowns_of(family)[first].is_log:
             low, mid, high = PER_CENT * np.expm1(np.array([low, mid, high]) / PER_CENT)
-        is_seen = not family or [one.sees for one in family for _ in one.unknowns][first]
+        is_seen = not family or [one.sees or one.effect[1] for one in family for _ in one.unknowns][first]
         estimates.append(
             Estimate(f"{name} seen aside" if is_seen and unit != "degrees" else name, unit, mid, low, high)
         )

@@ -93,15 +93,16 @@ def _aggregate(
         zero, one = ends[variant.task]
         return (variant.samples(variant.area, lambda values, axis: values) - zero) / (one - zero)
 
-    def spread(samples: np.ndarray) -> Interval:
+    def spread(samples: np.ndarray, of: Sequence[Variant] = own) -> Interval:
         ends = np.quantile(samples[1:], [0.025, 0.975], axis=0)
-        return Interval(samples[0], *(ends if min(len(one.seeds) for one in own) > 1 else ends + np.nan))
+        return Interval(samples[0], *(ends if min(len(one.seeds) for one in of) > 1 else ends + np.nan))
 
     tasks = [scores(one) for one in own]
     numbers = {name: spread(of(tasks)) for name, of in STATISTICS.items()}
     if own[0].guidance != "none":
-        pairs = zip(tasks, (scores(unguided_of(one, variants) or one) for one in own), strict=True)
-        numbers[IMPROVEMENT] = spread(np.mean([improvement(*pair) for pair in pairs], axis=0))
+        without = [unguided_of(one, variants) or one for one in own]
+        pairs = zip(tasks, map(scores, without), strict=True)
+        numbers[IMPROVEMENT] = spread(np.mean([improvement(*pair) for pair in pairs], axis=0), [*own, *without])
     above = [(np.concatenate(tasks, axis=1) > score).mean(axis=1) for score in THRESHOLDS]
     profile = Curve(THRESHOLDS, *spread(np.stack(above, axis=-1)))
     return replace(own[0], task="", failed=own[0].failed[:0]), profile, numbers

@@ -164,6 +164,8 @@ def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp
     _, _, commands = asked_for(monkeypatch, *logged)
     following = f"cuelearner adapt arm:policy --guidance reading --labels-from {tmp_path}/labels --labels 7"
     assert commands.following(7) == f"{following} --out policies/labels"
+    _, _, commands = asked_for(monkeypatch, *logged, "--bound", "0.1")
+    assert commands.following(7) == f"{following} --bound-deg 0.1 --out policies/labels"
     _, _, commands = asked_for(monkeypatch, "navigation", "--robot", "anymal", "--out", str(tmp_path))
     assert "--robot anymal" in commands.following(7)
 
@@ -182,11 +184,13 @@ def test_labels_are_inspected(labelled, capsys):
     assert "no labels to compare" in capsys.readouterr().out
 
 
-def test_labels_are_merged(labelled, tmp_path, refused):
+def test_labels_are_merged(labelled, tmp_path, refused, capsys):
     both = tmp_path / "both.parquet"
     assert main(["labels", "merge", str(labelled / "one"), str(labelled / "two"), "--out", str(both)]) == 0
     file = label_files.read(both)
     assert file.people.who.tolist() == ["one"] * 12 + ["two"] * 12
+    assert main(["labels", "inspect", str(both)]) == 0
+    assert "not known" not in capsys.readouterr().out  # what does not stand is left out
     refused(["labels", "merge", labelled / "one", "--out", both], "both.parquet exists: give another --out", tmp_path)
     refused(["labels", "inspect", both, "--teacher"], "cannot be asked about this file", tmp_path)
     refused(["labels", "mend"], "Available subcommands: inspect, merge", tmp_path)

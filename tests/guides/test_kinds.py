@@ -151,6 +151,17 @@ def test_answers_that_are_missing_are_no_corrections():
     assert not bool(fit(KEY, ENV, first(0, given), fresh, SCALARS).fitted)
 
 
+@pytest.mark.parametrize(("kind", "silent"), [("relative", True), ("dcoach", False)])
+def test_a_cue_that_one_label_names_is_silent_where_that_label_is_held_out(kind, silent):
+    words = (("x", ("right", "left")), ("y", ("up", "down")))
+    space = Box((-1.0,) * 2, (1.0,) * 2, tuple(Cue(name, both, (), "shares") for name, both in words))
+    guide, answer = registry.make(kind, SIZES, SimpleNamespace(actions=space, obs_size=3)), np.tile([1, UNSAID], (5, 1))
+    answer[4] = UNSAID, 1  # every fifth label is held out, by kinds that hold any
+    given = labels(jnp.float32(answer), jnp.zeros((5, 3)), jnp.zeros((5, 2)))
+    cues = np.asarray(guide.examples(given, dataclasses.replace(SCALARS, eps_deg=0.1)).cues)
+    assert cues[:4].tolist() == [[True, silent]] * 4
+
+
 @pytest.mark.parametrize("kind", ["relative", "clic"])
 def test_entries_that_nobody_is_asked_about_stay_and_those_of_which_nothing_is_said_hardly_move(kind):
     words = {"x": ("right", "left"), "y": ("", ""), "z": ("up", "down")}

@@ -57,7 +57,9 @@ def play(corrected):
 
 
 def test_a_shift_of_the_state_is_found_and_only_where_there_is_one():
-    corrected, (state,) = read(SEEN, 2, STATE).policy(), STATE
+    reading, (state,) = read(SEEN, 2, STATE), STATE
+    corrected = reading.policy()
+    assert any("state x seen aside: -0.07" in line for line in reading.result().words())
     np.testing.assert_allclose(corrected.correction.change.theta, -SEEN, atol=0.02)
     assert play(corrected)[0] < 0.02  # 0.27 before
     nothing = read(0 * SEEN, 0, STATE)

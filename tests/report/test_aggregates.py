@@ -64,6 +64,16 @@ def test_scores_are_normalised_by_task_and_pooled(tasks, tmp_path):
     assert (tmp_path / "report" / "profiles.png").exists()
 
 
+def test_a_probability_against_one_unguided_seed_has_no_interval(tmp_path):
+    for task, guided in (("small", [0.2, 0.4]), ("large", [30.0, 0.0])):
+        write(tmp_path / "runs" / f"{task}-none", task, "none", [0.1])
+        write(tmp_path / "runs" / f"{task}-relative", task, "relative", guided, 100)
+    report([tmp_path / "runs"], tmp_path / "report")
+    _, relative = table(tmp_path / "report" / "aggregates.csv")
+    assert (float(relative["probability_of_improvement"]), relative["probability_of_improvement_lower"]) == (0.75, "nan")
+    assert relative["mean_lower"]
+
+
 def test_equal_seeds_are_drawn_together_within_a_task_alone():
     values = np.arange(4.0)[:, None]
     one, alike, other = (Variant("none", 0, np.arange(4), np.zeros(1, int), values, task=task) for task in "aab")
