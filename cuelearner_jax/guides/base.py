@@ -18,15 +18,7 @@ from cuelearner_jax.config import GuideScalars, GuideSizes
 from cuelearner_jax.environment import Spaces
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.feedback.answers import RELATIVE, AnswerForm
-from cuelearner_jax.guides.fitting import (
-    Example,
-    GuideModel,
-    fit_model,
-    guide_model,
-    held_out,
-    silent_cues,
-    squared_errors,
-)
+from cuelearner_jax.guides.fitting import Example, GuideModel, fit_model, guide_model, silent_cues, squared_errors
 from cuelearner_jax.guides.refining import Refinement, bound_scalars, no_refinement, refine
 from cuelearner_jax.spaces import is_answered
 from cuelearner_jax.types import Action, Actions, GuidanceModel, Label, Observation, Observations, Params
@@ -124,8 +116,7 @@ class Guide:
             return rows
         cues = is_answered(labels.answer)
         valid = labels.valid & cues.any(-1)
-        learned = valid & ~held_out(len(valid)) if self.holds_out else valid
-        return rows.replace(valid=valid, cues=cues | silent_cues(labels.answer, learned))
+        return rows.replace(valid=valid, cues=cues | silent_cues(labels.answer, valid, self.holds_out))
 
     def augmented(self, key: PRNGKeyArray, batch: Any) -> Any:
         """Return the batch to train on in place of a batch (n, ...) of examples."""

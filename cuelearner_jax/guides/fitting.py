@@ -142,9 +142,10 @@ def held_out(count: int) -> Bool[np.ndarray, " count"]:
     return np.arange(count) % VALIDATION_STRIDE == VALIDATION_STRIDE - 1
 
 
-def silent_cues(answers: Float[Array, "n cues"], learned: Bool[Array, " n"]) -> Bool[Array, "1 cues"]:
+def silent_cues(answers: Float[Array, "n cues"], valid: Bool[Array, " n"], holds_out: bool) -> Bool[Array, "1 cues"]:
     """Return the cues that no label to fit names."""
-    return ~is_answered(answers).any(0, where=learned[:, None], keepdims=True)
+    rows = valid & ~held_out(len(valid)) if holds_out else valid
+    return ~is_answered(answers).any(0, where=rows[:, None], keepdims=True)
 
 
 def with_moments(params: Params, obs: Float[Array, "n obs"], rows: Bool[Array, " n"]) -> Params:

@@ -70,7 +70,10 @@ def test_a_probability_against_one_unguided_seed_has_no_interval(tmp_path):
         write(tmp_path / "runs" / f"{task}-relative", task, "relative", guided, 100)
     report([tmp_path / "runs"], tmp_path / "report")
     _, relative = table(tmp_path / "report" / "aggregates.csv")
-    assert (float(relative["probability_of_improvement"]), relative["probability_of_improvement_lower"]) == (0.75, "nan")
+    assert (float(relative["probability_of_improvement"]), relative["probability_of_improvement_lower"]) == (
+        0.75,
+        "nan",
+    )
     assert relative["mean_lower"]
 
 
