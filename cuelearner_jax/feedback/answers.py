@@ -208,8 +208,7 @@ def _slips(
     """Draw whether the teacher is mistaken, and whether it answers."""
     key_mistake, key_silence = jax.random.split(key)
     mistaken = jax.random.bernoulli(key_mistake, scalars.mistake_probability, shape)
-    silent = jax.random.bernoulli(key_silence, scalars.silence_probability, shape)
-    return mistaken, ~silent
+    return mistaken, ~jax.random.bernoulli(key_silence, scalars.silence_probability, shape)
 
 
 def _way(space: Space) -> str:

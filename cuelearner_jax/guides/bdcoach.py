@@ -63,8 +63,7 @@ class BatchCoach(DeepCoach):
 
     def human_loss(self, env: Any, human: Params, rows: Example, scalars: GuideScalars) -> Array:
         """Return the loss of the human model: its predictions about the asked actions against the answers."""
-        eps = self.spaces.actions.from_unit(scalars.eps_deg)
-        answers = rows.replace(target=(rows.target - rows.action) / eps)
+        answers = rows.replace(target=(rows.target - rows.action) / self.spaces.actions.from_unit(scalars.eps_deg))
         return jnp.mean(squared_errors(answers, self.member.network.predict(env, human, rows.obs, rows.action)))
 
     def policy_targets(self, env: Any, human: Params, rows: Example, acted: Array, scalars: GuideScalars) -> Example:

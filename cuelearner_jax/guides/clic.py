@@ -90,8 +90,7 @@ def log_desired(
         both = (log_nearer(worse, _size(x - h), SOFTNESS).mean() + FIRST_PAIRS * half) / (1 + FIRST_PAIRS)
         half = jnp.where(spoken.sum() > 1, both, half)  # along one cue alone there are no other directions
     still, moving = spoken & (h == 0), (h != 0).sum()
-    held = jnp.sum(log_still(x), where=still)
-    return (moving * half + held) / jnp.maximum(moving + still.sum(), 1)
+    return (moving * half + jnp.sum(log_still(x), where=still)) / jnp.maximum(moving + still.sum(), 1)
 
 
 def log_still(x: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -158,8 +158,7 @@ def with_moments(params: Params, obs: Float[Array, "n obs"], rows: Bool[Array, "
     mean, variance = networks.moments_of(obs, rows).values()
     varies = variance > LEAST**2 + jnp.square(1e-6 * mean)
     moments = {"mean": mean, "variance": jnp.where(varies, variance, NOTHING)}
-    shaped = lambda new, old: jnp.broadcast_to(new, old.shape)  # noqa: E731
-    return {**params, "obs": jax.tree.map(shaped, moments, params["obs"])}
+    return {**params, "obs": jax.tree.map(lambda new, old: jnp.broadcast_to(new, old.shape), moments, params["obs"])}
 
 
 def fit_model(
@@ -217,8 +216,7 @@ def fit_model(
     if hasattr(rows, "obs"):
         params = with_moments(params, rows.obs, rows.valid)
     keys = jax.random.split(k_steps, (sizes.fit_steps // sizes.validate_every, sizes.validate_every))
-    start = ((params, adam.init(params)), params, jnp.inf)
-    (_, best, score), _ = jax.lax.scan(stretch, start, keys)
+    (_, best, score), _ = jax.lax.scan(stretch, ((params, adam.init(params)), params, jnp.inf), keys)
     diverged = ~jnp.isfinite(score) & validation.any()
     best = jax.tree.map(lambda leaf: jnp.where(diverged, jnp.nan, leaf), best)
     return GuidanceModel(best, training.any())

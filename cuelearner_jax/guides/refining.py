@@ -62,11 +62,9 @@ def refine(
     def one_pass(carry: tuple[Array, ...]) -> tuple[Array, ...]:
         current, done, passes, k = carry
         done = done | (k >= k_max)  # reached between two looks
-        proposal = space.retract(current + residual(current))
-        proposal = space.clip(proposal, first, tau_max)
+        proposal = space.clip(space.retract(current + residual(current)), first, tau_max)
         settled = space.distance(current, proposal) < tau
-        following = jnp.where(done[:, None], current, proposal)
-        return following, done | settled, passes + ~done, k + 1
+        return jnp.where(done[:, None], current, proposal), done | settled, passes + ~done, k + 1
 
     at_once = portions().passes
     body = (

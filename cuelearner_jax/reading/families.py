@@ -208,8 +208,7 @@ def _turned(quantity: Quantity, start: int) -> Distortion:
 
     def sees(theta: Array, obs: Array) -> Array:
         cos, sin = jnp.cos(jnp.deg2rad(theta[0])), jnp.sin(jnp.deg2rad(theta[0]))
-        every = jnp.arange(len(obs))
-        other = obs[every.at[x].add(1).at[y].add(-1)]
+        other = obs[jnp.arange(len(obs)).at[x].add(1).at[y].add(-1)]
         along = jnp.ones(len(obs)).at[x].set(cos).at[y].set(cos)
         return along * obs + jnp.zeros(len(obs)).at[x].set(sin).at[y].set(-sin) * other
 

@@ -125,8 +125,7 @@ class Reader:
         whole = self._probe(frame, _one(change), labels.obs)[0]
         steady = ~linear.jumps(self.space, whole, self.eps).any(-1)
         if not self.family:
-            mixed = linear.influence(self.space, labels, whole)
-            frame = linear.frame_of((), labels, None, mixed)
+            frame = linear.frame_of((), labels, None, linear.influence(self.space, labels, whole))
         return frame, steady
 
     def _start(self, frame: ObservationFrame, labels: RelativeLabels, plain: Hypothesis) -> Hypothesis:
@@ -173,8 +172,7 @@ class Reader:
     def act(self, fitted: Fit, obs: Observations) -> Actions:
         """Return corrected actions by one fit."""
         before = linear.undone(self.family, fitted.hypothesis.change, obs)
-        actions = self._ask(jnp.stack([obs, before]))
-        return _act(self.space, self.family, fitted, obs, before, actions, self.eps)
+        return _act(self.space, self.family, fitted, obs, before, self._ask(jnp.stack([obs, before])), self.eps)
 
     def predict(
         self, fitted: Fit, labels: RelativeLabels
@@ -211,10 +209,8 @@ def correction(fitted: Fit, eps: Any) -> Correction:
 def again(fitted: Fit) -> tuple[Hypothesis, Hypothesis]:
     """Return where the next `Reader.read` starts: the hypotheses of this one."""
     count = len(HYPOTHESES)
-    plain, smooth = (
-        jax.tree.map(lambda leaf, part=part: leaf[part], fitted.hypothesis)
-        for part in (slice(0, count), slice(count, None))
-    )
+    of = lambda part: jax.tree.map(lambda leaf: leaf[part], fitted.hypothesis)  # noqa: E731
+    plain, smooth = of(slice(0, count)), of(slice(count, None))
     wide = lambda hyper: hyper.replace(width=jnp.full_like(hyper.width, WIDE), lapse=jnp.zeros_like(hyper.lapse))  # noqa: E731
     hyper = wide(plain.hyper.replace(amplitudes=jnp.zeros(count)))
     smooth = smooth.replace(hyper=wide(smooth.hyper))
@@ -259,8 +255,7 @@ def _moves(family: Family, frame: ObservationFrame, change: Change) -> Change:
     entries = jnp.arange(size) if family else frame.mixed
     each = jnp.eye(size)[entries] * frame.step[None]
     several = (jnp.array(TRIED)[:, None, None] * each[None]).reshape(len(TRIED) * len(entries), size)
-    moves = jnp.concatenate([jnp.zeros((1, size)), several])
-    return _one(change.replace(theta=change.theta[None] + moves))
+    return _one(change.replace(theta=change.theta[None] + jnp.concatenate([jnp.zeros((1, size)), several])))
 
 
 @jax.jit
@@ -331,8 +326,7 @@ def _scored(rows: Data, frame: ObservationFrame, hypothesis: Hypothesis, posteri
     def one(rows: Data, hypothesis: Hypothesis, posteriors: Posterior) -> Array:
         _, variance = posterior.predict(posteriors, rows, hypothesis.parts, rows.features, rows.inputs)
         # at the estimate itself, of which the linear model is only a tangent
-        weights = linear.weights_of(frame, hypothesis.change)
-        mean = rows.offset + rows.features @ weights
+        mean = rows.offset + rows.features @ linear.weights_of(frame, hypothesis.change)
         if hypothesis.parts.process:
             mean = mean + posterior.process(posteriors, rows.inputs, rows.inputs)
         habits = posterior.habits(posteriors.hyper, 1 / SCALE)

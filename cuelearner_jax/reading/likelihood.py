@@ -93,8 +93,7 @@ def predictive_log_likelihood(
     mean: Float[Array, "n cues"], variance: Float[Array, "n cues"], answers: Answers, habits: Habits
 ) -> Float[Array, "n cues"]:
     """Return log E[p(answer | change)] over normally distributed changes."""
-    wide = habits._replace(width=jnp.sqrt(habits.width**2 + variance))
-    return log_likelihood(mean, answers, wide)
+    return log_likelihood(mean, answers, habits._replace(width=jnp.sqrt(habits.width**2 + variance)))
 
 
 def curvature(

@@ -167,8 +167,7 @@ def influence(space: Space, labels: RelativeLabels, whole: Float[Array, "k n act
     """Return the entries on which the policy's actions depend most, from what it does at `sides`."""
     size = len(whole) // 2
     slope = jnp.nan_to_num(space.log(whole[1 : 1 + size], whole[1 + size :]))
-    effect = jnp.einsum("n,unc->u", labels.valid * 1.0, slope**2)
-    return jax.lax.top_k(effect, min(MIXED, size))[1]
+    return jax.lax.top_k(jnp.einsum("n,unc->u", labels.valid * 1.0, slope**2), min(MIXED, size))[1]
 
 
 def data(
@@ -213,8 +212,7 @@ def features(
     z = ((obs - frame.mean[None]) / frame.deviation[None])[:, frame.mixed]
     mixed = (-slope[:, :, frame.mixed, None] * z[:, None, None, :]).reshape(n, cues, len(frame.mixed) ** 2)
     cue, term = terms(cues, basis_size(space))
-    own = jnp.eye(cues)[:, cue][None] * basis(space, base)[:, None, term]
-    return jnp.concatenate([slope, mixed, own], 2)
+    return jnp.concatenate([slope, mixed, jnp.eye(cues)[:, cue][None] * basis(space, base)[:, None, term]], 2)
 
 
 @partial(jax.jit, static_argnums=0)

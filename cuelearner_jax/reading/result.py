@@ -63,9 +63,7 @@ class Result(NamedTuple):
             return ["The answers ask for no change."]
         lines = [one.words() for one in self.estimates]
         if self.mixed:
-            lines.append(
-                f"entries of the observation are seen mixed, which moves actions by {self.mixed:.3g} typically"
-            )
+            lines += [f"entries of the observation are seen mixed, which moves actions by {self.mixed:.3g} typically"]
         if self.depends:
             near = f", near labels, where {self.near:.0%} of the situations met lie" if self.near is not None else ""
             lines.append(f"beyond that, corrections depend on the situation: {self.depends:.3g} typically{near}")
@@ -99,18 +97,15 @@ def describe_fit(
     own = slice(len(weights) - linear.terms(*fitted.hypothesis.change.action.shape).shape[1], None)
     estimates += _of_action(weights[own], root[own], effect[:, own], space, eps)
     hyper, inputs = fitted.posterior.hyper, fitted.data.inputs
-    more = posterior.process(fitted.posterior, inputs, inputs)
+    more = np.asarray(posterior.process(fitted.posterior, inputs, inputs))[valid]
     mix = effect[:, unknowns : own.start] @ weights[unknowns : own.start]
-    sizes = [
-        SCALE * np.sqrt((each**2).mean()) if len(each) else 0.0 for each in (mix, np.asarray(more)[valid])
-    ]  # [eps]
+    sizes = [SCALE * np.sqrt((each**2).mean()) if len(each) else 0.0 for each in (mix, more)]  # [eps]
     mixed, depends = (float(space.to_unit(eps * size, np)) if size > SMALL else 0.0 for size in sizes)
     near = None
     if len(walk) and valid.any():
         alike = posterior.correlation(posterior.lengths(hyper), jnp.asarray(walk), inputs[valid])
         near = float((alike.max(1) >= ALIKE_SITUATION).mean())
-    wrong = float(posterior.habits(hyper, 1 / SCALE).lapse)
-    return tuple(estimates), mixed, depends, near, wrong
+    return tuple(estimates), mixed, depends, near, float(posterior.habits(hyper, 1 / SCALE).lapse)
 
 
 def _names(family: Family, count: int, observation: Sequence[Quantity]) -> list[tuple[str, str]]:
@@ -151,9 +146,8 @@ def _changes_of_observation(
         if family and unknowns_of(family)[first].is_log:
             low, mid, high = PER_CENT * np.expm1(np.array([low, mid, high]) / PER_CENT)
         is_seen = not family or [one.sees or one.effect[1] for one in family for _ in one.unknowns][first]
-        estimates.append(
-            Estimate(f"{name} seen aside" if is_seen and unit != "degrees" else name, unit, mid, low, high)
-        )
+        name += " seen aside" if is_seen and unit != "degrees" else ""
+        estimates.append(Estimate(name, unit, mid, low, high))
     return estimates
 
 

@@ -55,8 +55,7 @@ class Walk:
         self, key: PRNGKeyArray, states: EnvState, obs: Float[Array, "n obs"], actions: Float[Array, "n action"]
     ) -> tuple[Float[Array, "n cues"], Bool[Array, " n"]]:
         """Return the teacher's answers, and which questions are answered."""
-        keys = jax.random.split(key, len(obs))
-        return _answers(self.env, self.teacher, self.scalars, keys, states, obs, actions)
+        return _answers(self.env, self.teacher, self.scalars, jax.random.split(key, len(obs)), states, obs, actions)
 
 
 @partial(jax.jit, static_argnums=0)
