@@ -180,8 +180,7 @@ def guided_share(sums: ArmSums, options: Paced) -> Float[Array, ""]:
     error = jnp.sqrt((jnp.maximum(variance, pooled) / jnp.maximum(sums.episodes, TINY)).sum())
     error = error + RESOLUTION * (jnp.abs(own) + jnp.abs(guided)) + TINY
     better = jax.scipy.stats.norm.cdf((guided - own) / error)
-    lead = jnp.clip((guided - own) / jnp.maximum(options.lead, TINY), 0, 1)
-    worth = jnp.where(options.lead > 0, lead, 1)
+    worth = jnp.where(options.lead > 0, jnp.clip((guided - own) / jnp.maximum(options.lead, TINY), 0, 1), 1)
     most, floor = options.probability, jnp.float32(FLOOR)
     paced = jnp.clip(most * jnp.minimum(2 * better, 1) * worth, floor, 1 - floor)
     return jnp.where((sums.episodes >= ENOUGH).all(), jnp.minimum(paced, most), most)

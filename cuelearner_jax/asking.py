@@ -150,8 +150,7 @@ def record(
     base: Float[Array, "n action"] | None,
 ) -> GuideState:
     """Return the guide with answers in its labels from row `position` on; `base`: uncorrected actions, if kept."""
-    positions = position + jnp.arange(len(obs))
-    rows = Label(obs, action, answer, answered & (positions < guide.budget), base)
+    rows = Label(obs, action, answer, answered & (position + jnp.arange(len(obs)) < guide.budget), base)
     put = lambda rows_before, new: jax.lax.dynamic_update_slice_in_dim(rows_before, new, position, 0)  # noqa: E731
     count = jnp.minimum(position + len(obs), guide.budget)
     return guide.replace(labels=jax.tree.map(put, guide.labels, rows), asked=count)

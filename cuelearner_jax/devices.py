@@ -145,8 +145,7 @@ def over_lanes(mesh: Mesh, function: Callable[..., Any], takes: tuple[Any, ...],
             return function(*jax.tree.unflatten(structure, own))
 
         def empty(leaf: jax.Array, spec: PartitionSpec) -> jax.Array:
-            rows = len(leaf) // (mesh.size if spec == BY_LANE else 1)
-            return jnp.zeros((rows, *leaf.shape[1:]), leaf.dtype)
+            return jnp.zeros((len(leaf) // (mesh.size if spec == BY_LANE else 1), *leaf.shape[1:]), leaf.dtype)
 
         entering = tuple(compress(specs, full))
         mapped = jax.shard_map(share, mesh=mesh, in_specs=entering, out_specs=gives, check_vma=False)

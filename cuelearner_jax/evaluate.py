@@ -232,8 +232,7 @@ def rollout_lanes(
 def _on_mesh(env: Any, each: Any, shared: Any, key: PRNGKeyArray, *, mesh: Mesh, num_envs: int, steps: int) -> Rollout:
     def share(env: Any, each: Any, shared: Any, key: PRNGKeyArray) -> Rollout:
         one = lambda lane: _rolled(_together(lane, shared), env, key, num_envs, steps)  # noqa: E731
-        lanes = jax.tree.leaves(each)[0].shape[0]
-        return jax.lax.map(one, each, batch_size=min(lanes, portions().agents))
+        return jax.lax.map(one, each, batch_size=min(len(jax.tree.leaves(each)[0]), portions().agents))
 
     return over_lanes(mesh, share, (SHARED, BY_LANE, SHARED, SHARED), BY_LANE)(env, each, shared, key)
 
@@ -275,8 +274,7 @@ def _repeat(walk: _Walk, *, lanes: int) -> _Walk:
 def _walk(env: Any, each: Any, shared: Any, key: PRNGKeyArray, walk: _Walk, indices: Array) -> _Walk:
     if each is None:
         return _walked(shared, env, key, walk, indices)
-    one = lambda lane, walk: _walked(_together(lane, shared), env, key, walk, indices)  # noqa: E731
-    return jax.vmap(one)(each, walk)
+    return jax.vmap(lambda lane, walk: _walked(_together(lane, shared), env, key, walk, indices))(each, walk)
 
 
 @partial(jax.jit, static_argnames=("steps", "lanes"))

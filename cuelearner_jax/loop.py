@@ -218,8 +218,7 @@ class Lane(NamedTuple):
         filled, agent, schedule = clock.step + self.sizes.num_envs, state.agent, settings.schedule
         memory = Memory(env, self.buffer, agent.replay, filled, self.sizes.num_envs, self.bootstraps, agent.guided)
         if (stored := state.guide.stored) is not None:
-            labelled = Memory(env, self.buffer, stored, state.guide.asked, 1, self.bootstraps)
-            memory = memory._replace(labelled=labelled)
+            memory = memory._replace(labelled=Memory(env, self.buffer, stored, state.guide.asked, 1, self.bootstraps))
 
         def update(carry: tuple[Any, Any], index: Array) -> tuple[tuple[Any, Any], Any]:
             count, own = clock.update + index + 1, jax.random.fold_in(key, index)
@@ -256,5 +255,4 @@ def lane_of(sizes: Sizes, parts: Parts, guidance: Guide, largest_budget: int, en
     """Return the loop of one lane for parts whose float options are None; of the environment only shapes are used."""
     agent, arbiter, bootstraps = parts
     learner = agent.make(sizes.frame, spaces_of(env), bootstraps)
-    buffer = buffer_for(env, bootstraps)
-    return Lane(sizes, guidance, learner, arbiter, buffer, bootstraps, largest_budget)
+    return Lane(sizes, guidance, learner, arbiter, buffer_for(env, bootstraps), bootstraps, largest_budget)

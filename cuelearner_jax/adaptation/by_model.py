@@ -177,8 +177,7 @@ def _distances(space: Space, policy: Any, obs: Array, action: Array) -> Array:
 def plain_scalars(space: Space) -> Scalars:
     """Return default scalars in a space's unit, scaled by the space's reach; eps is at least the space's grain."""
     names = ("eps_deg", "tau_deg", "tau_max_deg", "scalar_within_deg", "nearest_aim_deg")
-    share = space.reach / DIRECTIONS.reach
-    scalars = replace(Scalars(), **{name: getattr(Scalars, name) * share for name in names})
+    scalars = replace(Scalars(), **{name: getattr(Scalars, name) * (space.reach / DIRECTIONS.reach) for name in names})
     return replace(scalars, eps_deg=max(scalars.eps_deg, space.grain)) if space.grain else scalars
 
 

@@ -168,8 +168,7 @@ class Judge:
         for share in (1.0, *self.how.bounds) if self.how.bounds else ():
             within = block.replace(bound=share * block.bound)
             what = f"the adapted policy within {share:g} of its bound"
-            policy = self.of.policy(within, self.how.env)
-            rolled, spent = self._rolled(policy, what, episodes(SPLIT), self.how.num_envs)
+            rolled, spent = self._rolled(self.of.policy(within, self.how.env), what, episodes(SPLIT), self.how.num_envs)
             steps = steps + spent
             better = np.asarray(rolled.means[self.how.by]) > value
             value = np.where(better, rolled.means[self.how.by], value)
@@ -271,14 +270,12 @@ def _predicted(of: Adaptation, block: LaneState) -> tuple[Array, Array]:
         key = jax.random.fold_in(lane.key, HELD_OUT)
         labels = fitted_labels(key, lane.guide.labels, of.scalars)
         held = labels.valid & (jnp.arange(labels.valid.shape[0]) % HELD_OUT == HELD_OUT - 2)
-        others = labels.replace(valid=labels.valid & ~held)
-        model = guidance.fit(key, env, others, guidance.init(key), of.scalars)
+        model = guidance.fit(key, env, labels.replace(valid=labels.valid & ~held), guidance.init(key), of.scalars)
         refined = guidance.act(model, env, labels.obs, labels.action, held, one_pass).actions
         moves = space.log(labels.action, refined) / space.from_unit(of.scalars.eps_deg)
         # words about one cue each; of the other cues nothing is compared
         counts = is_answered(labels.answer) & held[:, None]
-        count = jnp.maximum(counts.sum(), 1)
-        share = lambda flags: jnp.sum(flags, where=counts) / count  # noqa: E731
+        share = lambda flags: jnp.sum(flags, where=counts) / jnp.maximum(counts.sum(), 1)  # noqa: E731
         right = share(jnp.round(jnp.clip(moves, -1, 1)) == labels.answer)
         return share(labels.answer == 0), jnp.where(counts.any(), right, jnp.nan)
 

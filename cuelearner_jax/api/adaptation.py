@@ -282,8 +282,7 @@ def agreement(
         space = policy.actions
     file = _labels(labels, space)
     if eps is None and (eps := file.eps) is None:
-        source = policy.outcome.request if isinstance(policy, AdaptedPolicy) else own
-        scalars = getattr(source, "scalars", None)
+        scalars = getattr(policy.outcome.request if isinstance(policy, AdaptedPolicy) else own, "scalars", None)
         if scalars is None and getattr(own, "base", None) is not None:
             raise UserError("eps is None, and a loaded reading no longer knows how strong its answers were: give eps=")
         eps = float((scalars or plain_scalars(file.space)).eps_deg)

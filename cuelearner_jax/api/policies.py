@@ -104,8 +104,7 @@ def as_policy_in(source: Any, env: Any) -> Policy:
 
 def config_of(policy: Any, world: World) -> RunConfig:
     """Return the configuration of a policy's training, or a stand-in, in a world."""
-    config = getattr(policy, "trained", None) or world.task.start()
-    return dataclasses.replace(config, task=world.config)
+    return dataclasses.replace(getattr(policy, "trained", None) or world.task.start(), task=world.config)
 
 
 @user_code.report_user_errors

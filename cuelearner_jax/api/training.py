@@ -112,8 +112,7 @@ def train(
     config = dataclasses.replace(config, task=world.config)
     request = TrainRequest(task, config, grid, labels_from=file, split=split)
     results, trainings = study.in_memory(request, world.env, world.environment(split), teacher, progress)
-    failed = failures.summary(results)
-    if failed:
+    if failed := failures.summary(results):
         warnings.warn(f"{failed}: leave out the rows with failed = 1", stacklevel=2)
     return Run(world, config, results, trainings)
 

@@ -175,8 +175,7 @@ class NearAims(PolicyNode):
         space, aims = actions_of(self.view), self.view.aims(obs)
         index = jax.random.categorical(k_aim, jnp.where(aims.possible, 0.0, -jnp.inf))
         change = jax.random.uniform(k_turn, (len(space.cues),), minval=-self.reach, maxval=self.reach)
-        elsewhere = space.sample(k_elsewhere)
-        return jnp.where(aims.possible.any(), space.exp(aims.actions[index], change), elsewhere)
+        return jnp.where(aims.possible.any(), space.exp(aims.actions[index], change), space.sample(k_elsewhere))
 
     def describe(self) -> dict[str, Any]:
         """Return the kind of policy and its reach, as JSON values."""

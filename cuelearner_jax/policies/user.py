@@ -223,8 +223,7 @@ class Teaching(struct.PyTreeNode):
 
     def best_action(self, state: EnvState, obs: Float[Array, " obs"]) -> Float[Array, " action"]:
         """Return the policy's action; a random policy always draws the same."""
-        states = jax.tree.map(lambda leaf: leaf[None], state)
-        return self.policy.act(jax.random.key(0), states, obs[None])[0]
+        return self.policy.act(jax.random.key(0), jax.tree.map(lambda leaf: leaf[None], state), obs[None])[0]
 
 
 def teaching(source: Any, space: Space) -> Teacher:
