@@ -186,8 +186,7 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
     caption = f"mean [95% bootstrap interval]; {SHARES}; of the difference over {over}"
     table = Table("metric", "policy", "against", "difference", title=heading, caption=caption)
     for name, less in difference.metrics.items():
-        own = (str(measurements.spread(row, name)) for row in both)
-        table.add_row(name, *own, f"{less:+}")
+        table.add_row(name, *(str(measurements.spread(row, name)) for row in both), f"{less:+}")
     return table
 
 

@@ -185,14 +185,13 @@ def check_numbers(options: Any, **bounds: tuple[float, float]) -> None:
 
 def about(kind: type, task: Task, policies: bool = False, preset: str = PAPER) -> str:
     """Return the text above a command's options: its purpose and the names to choose from. `preset`: the default."""
-    scenarios = {
-        name: f"{one.about} ({' '.join(as_options('task', one.changes))})" for name, one in task.scenarios.items()
-    }
     presets = {name: f"{one.about}{f' ({one.takes})' if one.takes else ''}" for name, one in task.presets.items()}
     default = f"; {task.first_preset(preset)} where none is given" if presets else ""
     groups = {
         f"presets (--preset{default})": presets,
-        "changed worlds (--scenario)": scenarios,
+        "changed worlds (--scenario)": {
+            name: f"{one.about} ({' '.join(as_options('task', one.changes))})" for name, one in task.scenarios.items()
+        },
         "robots (--robot)": {body.name: body.about for body in task.bodies if len(task.bodies) > 1},
         "guidance (--guidance; your own as package.module:NAME)": {
             name: one.about for name, one in guidances.guides().items()

@@ -47,8 +47,7 @@ def observations(env: Environment, policy: Policy, count: int = WALKERS * STEPS)
 
     def step(walk: tuple[Any, Array], key: PRNGKeyArray) -> tuple[tuple[Any, Array], Array]:
         state, obs = walk
-        action = policy.act(key, state, obs)
-        state, after = jax.vmap(env.step)(jax.random.split(key, WALKERS), state, action)
+        state, after = jax.vmap(env.step)(jax.random.split(key, WALKERS), state, policy.act(key, state, obs))
         return (state, after.obs), obs
 
     @jax.jit

@@ -59,8 +59,7 @@ def with_teacher(
     scalars = scalars if file.eps is None else dataclasses.replace(scalars, eps_deg=file.eps)
     one = jax.jit(lambda env, teacher, *question: as_teacher(form, env, scalars, teacher, *question))
     answers = np.asarray(file.labels.answer)
-    guides = [(situations[item], items[item][1]) for item in file.people.item]
-    about = zip(guides, answers, strict=True)
+    about = zip([(situations[item], items[item][1]) for item in file.people.item], answers, strict=True)
     theirs = np.stack([one(env, teacher, guide.env, guide.obs, action, answer) for (guide, action), answer in about])
     return agreement(form, file.space, answers, theirs)
 

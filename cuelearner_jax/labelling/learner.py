@@ -157,8 +157,7 @@ class Learner:
 
     def fit(self, rows: Sequence[Row]) -> None:
         """Fit to these labels, of which no more count than the session wants."""
-        rows = rows[: len(self._blank.labels.valid)]
-        if rows:
+        if rows := rows[: len(self._blank.labels.valid)]:
             self.newest = self._reading_of(rows) if self._reads else self._model_of(rows)
 
     def _model_of(self, rows: Sequence[Row]) -> Fitted:

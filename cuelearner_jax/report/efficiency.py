@@ -139,8 +139,7 @@ def _level(variants: Sequence[Variant], question: Question) -> tuple[float, str]
     at = question.level_at if question.level_at is not None else int(shared[-1])
     if at not in steps:
         raise UserError(f"--level-at {at}: {unguided.name} has no such step, but {', '.join(map(str, steps))}")
-    level = float(unguided.curve.estimate[np.flatnonzero(steps == at)[0]])
-    return level, f"that of {unguided.name} at step {at:,}"
+    return float(unguided.curve.estimate[np.flatnonzero(steps == at)[0]]), f"that of {unguided.name} at step {at:,}"
 
 
 def _row(own: Sampled, unguided: Sampled | None) -> Row:

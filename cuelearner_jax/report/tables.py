@@ -77,8 +77,7 @@ def _against(variant: Variant, unguided: Variant, sign: float) -> Row:
 
 def _steps_to(variant: Variant, sign: float, level: float) -> Row:
     """Return the columns of the step from which a variant's seeds stay at a level; an interval for several seeds."""
-    bounds = lambda curves: statistics.steps_to_level(variant.curve.steps, sign * curves, level)  # noqa: E731
-    own, *draws = variant.samples(bounds)
+    own, *draws = variant.samples(lambda curves: statistics.steps_to_level(variant.curve.steps, sign * curves, level))
     numbers = (own[1], *(statistics.censored_interval(np.array(draws)) if len(variant.seeds) > 1 else ()))
     return dict(zip(REACHES, (round(float(step)) if np.isfinite(step) else "never" for step in numbers), strict=False))
 

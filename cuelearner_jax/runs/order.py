@@ -166,8 +166,7 @@ def _check_world(path: Path, head: dict[str, Any], task: Task, world: Any) -> No
     if (name := head.get("name")) != task.name:
         raise UserError(f"{path} holds labels of {name}, but the task is {task.name}: give labels of the same task")
     theirs, ours = configuration.to_json(configuration.from_json(task.config, head)), configuration.to_json(world)
-    apart = [name for name in ours if theirs[name] != ours[name] and name not in task.labels_hold]
-    if apart:
+    if apart := [name for name in ours if theirs[name] != ours[name] and name not in task.labels_hold]:
         raise UserError(
             f"{path} holds labels of a world with another task.{apart[0]} ({theirs[apart[0]]}; this run has "
             f"{ours[apart[0]]}): give labels of the same world"

@@ -80,8 +80,7 @@ class Choices(Space):
         """Return the steps between two choices; without an order 0 for the same, 1 for another."""
         if self.cues:
             return super().distance(action, other)
-        differ = jnp.argmax(jnp.asarray(action), -1) != jnp.argmax(jnp.asarray(other), -1)
-        return differ.astype(jnp.float32)
+        return (jnp.argmax(jnp.asarray(action), -1) != jnp.argmax(jnp.asarray(other), -1)).astype(jnp.float32)
 
     def words_of(self, action: Any) -> str:
         """Return the number of the choice."""

@@ -91,8 +91,7 @@ class Checkpoints(AbstractContextManager):
         """Write a checkpoint; return once it is complete on disk."""
         flat = {name: _flat(item) for name, item in items.items()}
         args: dict[str, Any] = {name: ocp.args.StandardSave(item) for name, item in flat.items()}
-        digests = {name: _digests(item) for name, item in flat.items()}
-        args[DIGESTS] = ocp.args.JsonSave({"run": self._run, **digests})
+        args[DIGESTS] = ocp.args.JsonSave({"run": self._run, **{name: _digests(item) for name, item in flat.items()}})
         self._manager.save(number, args=ocp.args.Composite(**args))
         self._manager.wait_until_finished()
 

@@ -138,6 +138,5 @@ def failures(table: pa.Table) -> dict[tuple[str, int, int], int]:
     """Return the failed lanes of a results table, each with the first step marked as failed, in order."""
     if FAILED not in table.column_names:
         return {}
-    rows = table.filter(pc.field(FAILED) == 1.0)
-    first = rows.group_by(list(LANE)).aggregate([("step", "min")]).to_pylist()
+    first = table.filter(pc.field(FAILED) == 1.0).group_by(list(LANE)).aggregate([("step", "min")]).to_pylist()
     return dict(sorted((tuple(row[name] for name in LANE), row["step_min"]) for row in first))

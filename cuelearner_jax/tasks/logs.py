@@ -151,8 +151,7 @@ class Logs(WholeObservations, struct.PyTreeNode):
         change = self.actions.to_unit(self.actions.distance(self.recorded[state.row], action))
         ended = following.count >= len(self.rows)
         state, obs = jax.tree.map(partial(jnp.where, ended), (anew, first), (following, final_obs))
-        reward = jnp.zeros(())
-        return state, Step(obs, final_obs, final_obs, reward, jnp.array(False), ended, {"change": change}, {})
+        return state, Step(obs, final_obs, final_obs, jnp.zeros(()), jnp.array(False), ended, {"change": change}, {})
 
 
 class Recorded(PolicyNode):

@@ -93,8 +93,7 @@ def make_registered(name: str, arguments: dict[str, Any], max_steps: int, spec: 
             raise
     import gymnasium
 
-    limited = {"max_episode_steps": max_steps} if max_steps else {}
-    return gymnasium.make(spec or own, **limited, **arguments)
+    return gymnasium.make(spec or own, **({"max_episode_steps": max_steps} if max_steps else {}), **arguments)
 
 
 def make_from_code(factory: Callable[..., Any], arguments: dict[str, Any]) -> Any:
