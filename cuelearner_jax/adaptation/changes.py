@@ -12,15 +12,8 @@ import numpy as np
 from cuelearner_jax import plugins
 from cuelearner_jax.environment import Environment, actions_of
 from cuelearner_jax.errors import UserError, format_value
-from cuelearner_jax.reading.families import (
-    Distortion,
-    Family,
-    check_family,
-    declared_distortions,
-    undo_action,
-    undo_observation,
-    unknowns_of,
-)
+from cuelearner_jax.reading import families
+from cuelearner_jax.reading.families import Distortion, Family
 
 SITUATIONS = 8  # situations in which distortions at zero are checked to change nothing
 SAME = 1e-4  # largest difference of an entry in that check
@@ -38,7 +31,7 @@ def family_of(changes: Any, env: Any) -> Family:
     if not isinstance(several, list | tuple) or not all(isinstance(one, Distortion) for one in several):
         advice = "give a cuelearner_jax.Distortion, several, or a function of the environment that returns them"
         raise UserError(f"changes is {format_value(changes)}: {advice}")
-    return check_family(several)
+    return families.check_family(several)
 
 
 def check_acts(family: Family, env: Environment) -> None:
@@ -48,9 +41,9 @@ def check_acts(family: Family, env: Environment) -> None:
     obs, actions = jax.vmap(env.reset)(keys)[1], space.sample(k_action, (SITUATIONS,))
     for one in family:
         nothing = jnp.zeros(len(one.unknowns))
-        acts = jax.vmap(partial(undo_action, (one,), nothing))
+        acts = jax.vmap(partial(families.undo_action, (one,), nothing))
         for name, rows, result in (
-            ("sees", obs, jax.vmap(partial(undo_observation, (one,), nothing))(obs)),
+            ("sees", obs, jax.vmap(partial(families.undo_observation, (one,), nothing))(obs)),
             ("acts" if one.plans is None else "plans", actions, acts(obs, actions)),
         ):
             if result.shape != rows.shape or not np.allclose(result, rows, atol=SAME, rtol=SAME):
@@ -69,10 +62,10 @@ def rebuild_family(layer: dict[str, Any], env: Any, changes: Any = None) -> Fami
     if code and changes is None:
         why = f"this policy corrects changes of code, {code}, which is not loaded because a file names it"
         raise UserError(f"{why}: add --changes {code} (from Python changes=...) if you trust that code")
-    by_name = {one.name: one for one in (family_of(changes, env) if code else declared_distortions(env))}
+    by_name = {one.name: one for one in (family_of(changes, env) if code else families.declared_distortions(env))}
     family = tuple(by_name[name] for name in names if name in by_name)
     units = [(one["name"], one["unit"]) for one in layer["changes"]]
-    if len(family) < len(names) or [(one.name, one.unit) for one in unknowns_of(family)] != units:
+    if len(family) < len(names) or [(one.name, one.unit) for one in families.unknowns_of(family)] != units:
         why = f"this policy corrects {', '.join(names)}, which {code or 'this world'} lacks or has otherwise"
         raise UserError(f"{why}: give the code that made the policy")
     return family
