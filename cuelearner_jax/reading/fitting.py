@@ -121,12 +121,10 @@ class Reader:
     def _frame(self, labels: RelativeLabels) -> tuple[ObservationFrame, Bool[Array, " n"]]:
         """Return the units of the linear model, and the labels about which the policy answers steadily."""
         frame = linear.frame_of(self.family, labels, self.step)
-        change = linear.no_change(self.space, self.family, labels.obs.shape[-1])
-        whole = self._probe(frame, _one(change), labels.obs)[0]
-        steady = ~linear.jumps(self.space, whole, self.eps).any(-1)
+        whole = self._probe(frame, _one(linear.no_change(self.space, self.family, labels.obs.shape[-1])), labels.obs)[0]
         if not self.family:
             frame = linear.frame_of((), labels, None, linear.influence(self.space, labels, whole))
-        return frame, steady
+        return frame, ~linear.jumps(self.space, whole, self.eps).any(-1)
 
     def _start(self, frame: ObservationFrame, labels: RelativeLabels, plain: Hypothesis) -> Hypothesis:
         """Return where fits start: where they were, or at shifts of few entries that explain the answers much better.
@@ -244,8 +242,7 @@ def _predicted(
     parts, hyper = fitted.hypothesis.parts, fitted.posterior.hyper
     _, variance = posterior.predict(fitted.posterior, fitted.data, parts, rows.features, rows.inputs)
     mean = space.log(labels.action, action) / (SCALE * eps)
-    habits = posterior.habits(hyper, 1 / SCALE)
-    return mean, variance, predictive_log_likelihood(mean, variance, rows.answers, habits)
+    return mean, variance, predictive_log_likelihood(mean, variance, rows.answers, posterior.habits(hyper, 1 / SCALE))
 
 
 @partial(jax.jit, static_argnames="family")
@@ -269,8 +266,7 @@ def _best(tried: Change, worth: Array) -> tuple[Change, Array]:
 def _replace_worse(changes: Change, own: Array, change: Change, worth: Array) -> Change:
     """Return the estimates of all hypotheses with their own worth, in which another estimate replaces worse ones."""
     better = (worth > own + WORTH) & jnp.array(["seen" in names for names in HYPOTHESES])
-    choose = jax.vmap(jnp.where, (0, None, 0))
-    return jax.tree.map(lambda own, other: choose(better, other, own), changes, change)
+    return jax.tree.map(lambda own, other: jax.vmap(jnp.where, (0, None, 0))(better, other, own), changes, change)
 
 
 @partial(jax.jit, static_argnames=("space", "family"))

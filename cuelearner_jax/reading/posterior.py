@@ -208,8 +208,7 @@ def _inverse_of_triangle(factor: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 def _log_prior(hyper: Hyper, parts: ModelParts) -> Array:
     own = hyper.replace(sizes=hyper.sizes * parts.weights)
-    terms = [((getattr(own, name) / spread) ** 2).sum() for name, spread in SPREADS.items()]
-    return -0.5 * jnp.stack(terms).sum()
+    return -0.5 * jnp.stack([((getattr(own, name) / spread) ** 2).sum() for name, spread in SPREADS.items()]).sum()
 
 
 def infer(data: Data, parts: ModelParts, eps: Float[Array, ""], start: Posterior) -> Posterior:
