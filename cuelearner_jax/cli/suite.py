@@ -172,8 +172,7 @@ def _world(name: str, values: dict[str, Any]) -> World:
     source, start = source_of(look_ahead(shlex.split(values["subject"]))), values.get("scenario")
     config = source.config
     if values["use"] == ADAPT:
-        changes = source.task.scenario(start).changes if start else {}
-        config = replace(config, task=replace(config.task, **changes))
+        config = replace(config, task=source.task.scenario(start).apply(config.task)) if start else config
         sizes = {key: plain(value) for key, value in groups.pop("sizes", {}).items()}
     else:
         start, preset = preset_of(source.task, values.get("preset"), QUICKSTART)

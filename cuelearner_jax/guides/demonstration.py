@@ -40,10 +40,8 @@ class Demonstration(Guide):
 
     def predict(self, env: Any, params: Params, obs: Observations, actions: Actions) -> Actions:
         """Return the policy's action, seen from `actions`."""
-        if not self.looks_again:
-            middle = self._middle(actions)
-            return middle + self.network.predict(env, params, obs, middle)
-        return actions + self.network.predict(env, params, obs, actions)
+        start = actions if self.looks_again else self._middle(actions)
+        return start + self.network.predict(env, params, obs, start)
 
     def augmented(self, key: PRNGKeyArray, batch: Example) -> Example:
         """Return a batch seen half from uniform directions, half from the actions asked about."""

@@ -183,9 +183,7 @@ class Session(AbstractContextManager[Any, None]):
 
     def _prepare(self, number: int) -> None:
         """Make an item ready to be shown; the item before it exists already."""
-        item = self._items.get(number)
-        if item is None:
-            item = self.questions.ask(number, self.questions.after(self._items[number - 1]))
+        item = self._items.get(number) or self.questions.ask(number, self.questions.after(self._items[number - 1]))
         self._items[number] = self.questions.draw(item)
 
     def _show(self, number: int) -> None:

@@ -118,11 +118,8 @@ class Training:
         """Take a file's labels in place of questions, and fit once."""
         group = self.group
         slots = label_slots(group.largest_budget, group.config.sizes)
-        rows = [
-            jax.tree.map(jnp.asarray, label_files.for_lanes(file, seeds, budgets, slots))
-            for seeds, budgets in group.blocks()
-        ]
-        self.blocks = group.take_labels(rows, self.blocks)
+        rows = [label_files.for_lanes(file, *lanes, slots) for lanes in group.blocks()]
+        self.blocks = group.take_labels(jax.tree.map(jnp.asarray, rows), self.blocks)
         self.clock = place(group.mesh, self.clock.replace(round=jnp.asarray(group.rounds, jnp.int32)), SHARED)
 
     def guides(self, before: int) -> dict[str, Any]:

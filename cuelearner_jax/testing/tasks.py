@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +36,8 @@ def check_task(task: Task, small: Any = None, steps: int = 64, pictures: Path | 
         check_grid(Grid(preset.guidance or ("none",), (preset.first_seed,), preset.labels))
         env = shape_of(task, preset.config.task)
         sizes = {other: shape_of(task, one.apply(preset.config.task)).obs_size for other, one in task.scenarios.items()}
-        splits = [
-            jax.eval_shape(lambda split=split: task.environment(preset.config.task, split))  # noqa: B023
-            for split in ("training", *SPLITS)
-        ]
+        make = partial(task.environment, preset.config.task)
+        splits = [jax.eval_shape(partial(make, split)) for split in ("training", *SPLITS)]
         possible = registry.possible(env, taught=task.teacher is not None)
         odd = [kind for kind in preset.guidance if registry.resolve(kind).name not in possible]
         laws.hold(not odd, f"preset {name!r} compares guidance {odd[:1]}, which it cannot have: of {list(possible)}")
