@@ -31,7 +31,6 @@ NUMERICS = {
     "debug_nans": False,
 }
 
-
 _written_out = ContextVar("written out", default=False)
 
 

@@ -121,9 +121,8 @@ def ask_in_batches(
     for start in range(0, budget, size):
         tell(start)
         key, k_where, k_ask, k_answer = jax.random.split(key, 4)
-        count = min(size, budget - start)
         states, obs = walk.situations(k_where, reading.policy(), CHOICE * size)
-        index, action = reading.questions(np.asarray(obs), count, k_ask)
+        index, action = reading.questions(np.asarray(obs), min(size, budget - start), k_ask)
         states, obs = pick((states, obs), index)
         answer, valid = map(np.asarray, walk.answers(k_answer, states, obs, jnp.asarray(action)))
         user_code.check_actions(answer[valid], f"teacher {type(walk.teacher).__name__}")

@@ -133,10 +133,9 @@ def _begin(guidance: Guide, sizes: GuideSizes, slots: int, env: Any, columns: An
 
 def begin(of: Adaptation, lanes: Lanes) -> LaneState:
     """Return lanes that have asked nothing yet. Their number must divide among the devices of the mesh used later."""
-    slots = rounds(lanes, of.sizes) * of.sizes.labels_per_round
     bound = actions_of(of.env).from_unit(lanes.bound_deg)
     columns = (*(jnp.asarray(column) for column in (lanes.base, lanes.seed, lanes.budget)), bound)
-    return _begin(of.guidance, of.sizes, slots, of.env, columns)
+    return _begin(of.guidance, of.sizes, rounds(lanes, of.sizes) * of.sizes.labels_per_round, of.env, columns)
 
 
 @partial(jax.jit, static_argnames="mesh")

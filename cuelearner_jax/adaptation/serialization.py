@@ -89,8 +89,7 @@ def from_json(values: dict[str, Any], env: Any, code: Any = None, changes: Any =
         return Guided(base, jax.eval_shape(guide.init, key), view_of(env), scalars, guide, bound, guide.sizes)
     if kind == READING:
         base, family = from_json(values["base"], env, code, changes), own_changes.rebuild_family(values, env, changes)
-        sizes = values["labels"], values["mixed"]
-        return unread(base, actions_of(env), family, env.obs_size, *sizes, reference=values["code"])
+        return unread(base, actions_of(env), family, env.obs_size, values["labels"], values["mixed"], values["code"])
     if kind != "code":
         raise UserError(f"{kind!r} is not a kind of policy that this program knows: use the cuelearner that wrote it")
     if code is None:

@@ -188,8 +188,7 @@ def adapt(
         raise UserError("the fit of the feedback model diverged: lower scalars.feedback_learning_rate")
     if not result.judgement.in_use.all():
         warnings.warn(result.words[-1], stacklevel=3)
-    about = {"trained": config, "actions": own_world.actions}
-    about["world"] = None if own_world is not world else world
+    about = {"trained": config, "actions": own_world.actions, "world": world if own_world is world else None}
     return AdaptedPolicy(result.policy(env).lane(0), getattr(env, "observation", ()), **about, outcome=outcome)
 
 

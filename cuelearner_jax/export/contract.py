@@ -129,11 +129,10 @@ def _artefact(
         missing = f"{', '.join(traced.missing)}, which this policy needs"
         raise UserError(f"--format {format} does not support {missing}: give --format stablehlo")
     if format == "onnx":
-        contents = onnx_graph.serialize(traced, inputs, outputs)
         about = {"needs": "onnxruntime", "opset": onnx_graph.OPSET}
         about |= dict(zip(("input", "base_input"), onnx_graph.INPUTS[: len(inputs)], strict=False))
         about |= dict(zip(("output", "base_output"), onnx_graph.OUTPUTS[: len(outputs)], strict=False))
-        return "decision.onnx", contents, about
+        return "decision.onnx", onnx_graph.serialize(traced, inputs, outputs), about
     graph, stored = np.frombuffer(json.dumps(traced.graph._asdict()).encode(), np.uint8), io.BytesIO()
     arrays: dict[str, Any] = {"graph": graph, **traced.constants}
     np.savez(stored, **arrays)

@@ -121,8 +121,7 @@ def golden_cases(
     incomplete.
     """
     candidates = np.asarray(candidates, np.float32)
-    beyond = extreme_observations(candidates)[: 0 if traced.missing else most // 4]
-    obs = np.concatenate([candidates, beyond])
+    obs = np.concatenate([candidates, extreme_observations(candidates)[: 0 if traced.missing else most // 4]])
     decide = jax.jit(row_by_row(policy))
     actions = np.asarray(decide(jnp.asarray(obs)))
     user_code.check_actions(actions[: len(candidates)], policy_name(policy))

@@ -183,9 +183,8 @@ class Guide:
         """Return `refine` of the entries in question, within the scalars' limits; `k_max`: other passes at most."""
         space = self.spaces.actions
         limits = {"tau": space.from_unit(scalars.tau_deg), "tau_max": space.from_unit(scalars.tau_max_deg)}
-        most = scalars.k_max if k_max is None else k_max
         change = lambda current: self.in_question(jnp.zeros_like(current), residual(current))  # noqa: E731
-        return refine(change, actions, active, space=space, **limits, k_max=most)
+        return refine(change, actions, active, space=space, **limits, k_max=scalars.k_max if k_max is None else k_max)
 
 
 def replaced(others: Actions, actions: Actions, rows: Rows) -> Refinement:

@@ -139,8 +139,7 @@ class Page:
         elif name.startswith("film"):
             await self._show_film(name.removeprefix("film-"), number)
         elif control is not None or (name == "point" and self.form.is_action and angle is not None):
-            why = await self._taken(control, number, angle, data.get("seconds"))
-            if why:
+            if why := await self._taken(control, number, angle, data.get("seconds")):
                 self._script(f"cue.refused({json.dumps(why)})")
             for page in list(self._pages):
                 page.refresh()

@@ -113,7 +113,6 @@ def section(over: Aggregates, level: float | None) -> list[str]:
     names = [*STATISTICS, IMPROVEMENT]
     each = [(identity(variant), numbers) for variant, _, numbers in over.each]
     rows = [[*map(markdown, own.values()), *(numbers.get(name, "") for name in names)] for own, numbers in each]
-    table = markdown_table([*each[0][0], *names], rows)
     note = NOTE.format("its best variant's" if level is None else "that of `--level`")
     ends = [f"- {markdown(task)}: 0 is {zero:.3f}, 1 is {one:.3f}" for task, (zero, one) in over.ends.items()]
-    return ["", "## Over tasks", "", *table, "", note, "", *ends]
+    return ["", "## Over tasks", "", *markdown_table([*each[0][0], *names], rows), "", note, "", *ends]

@@ -122,8 +122,7 @@ def _short(table: pa.Table, variants: Sequence[Variant]) -> list[str]:
         if furthest > last:
             words = f"the curve ends at {last:,}, the last step of all seeds"
             lines.append(f"{variant.name}: some seeds have reached step {furthest:,}; {words}")
-        evaluations = {step for step in rows["step"].to_pylist() if step <= last}
-        if left_out := len(evaluations) - len(variant.steps):
+        if left_out := len({step for step in rows["step"].to_pylist() if step <= last}) - len(variant.steps):
             lines.append(f"{variant.name}: {left_out} evaluations that not all seeds have are left out")
         if len(variant.seeds) == 1:
             lines.append(f"{variant.name}: a single seed, so there is no interval")

@@ -59,8 +59,7 @@ def _program_of(loop: tuple[Sizes, Parts, Guide, int], shapes: tuple[Any, Any], 
     lane = lane_of(*loop, jax.tree.unflatten(*shapes))
 
     def init(env, seeds, budgets, root):
-        keys = jax.vmap(lambda seed: jax.random.fold_in(root, seed))(seeds)
-        return each_lane(partial(lane.init, env))(keys, budgets)
+        return each_lane(partial(lane.init, env))(jax.vmap(partial(jax.random.fold_in, root))(seeds), budgets)
 
     def label_round(env, teacher, scalars, clock, state):
         rest, agent = state.replace(agent=None), state.agent  # the agent's state is large, and not needed for questions

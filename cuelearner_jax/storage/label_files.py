@@ -195,8 +195,7 @@ def _standing(table: pa.Table) -> pa.Table:
     items = zip(table["seed"].to_pylist(), table["item"].to_pylist(), strict=True)
     last = {item: row for row, item in enumerate(items)}
     responses = table["said"].to_pylist()
-    rows = [last[item] for item in sorted(last) if responses[last[item]] == ANSWERED]
-    return table.take(pa.array(rows, pa.int64()))
+    return table.take(pa.array([last[item] for item in sorted(last) if responses[last[item]] == ANSWERED], pa.int64()))
 
 
 def digest(path: Path) -> str:

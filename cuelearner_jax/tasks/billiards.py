@@ -19,8 +19,6 @@ from cuelearner_jax.tasks import presets
 from cuelearner_jax.types import Teacher
 
 SHIPPED_TEACHERS = Path(billiards.__file__).parent / "teachers"
-
-
 # Fields in which a learned teacher's world may differ from its own: the teacher and its search, data augmentation, and
 # changes that `Transferred` accounts for.
 TEACHERS = ("teacher", "aim_error_deg", "habit", "search_directions")

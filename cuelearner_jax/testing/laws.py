@@ -61,9 +61,8 @@ def check_space(space: Space) -> None:
     one, other = (space.sample(jax.random.key(seed), (SAMPLES,)) for seed in (0, 1))
     change = jax.jit(space.log)(one, other)
     reached, retracted = jax.jit(space.exp)(one, change), space.retract(one)
-    spread = space.spread(SAMPLES)
     laws.hold(change.shape == (SAMPLES, len(space.cues)), f"`log` has shape {change.shape}: give one number a cue")
-    for function, actions in (("sample", one), ("exp", reached), ("spread", spread)):
+    for function, actions in (("sample", one), ("exp", reached), ("spread", space.spread(SAMPLES))):
         laws.actions(space, actions, f"what `{function}` gives")
     laws.hold(laws.same(retracted, one), "`retract` changes actions: it must leave them as they are")
     if space.cues:
