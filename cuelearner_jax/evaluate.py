@@ -211,8 +211,7 @@ def rollout_lanes(
     counts as one lane. With a `mesh` its devices share the lanes, in one stretch without progress; without one it is
     done in stretches, as many lanes at once as the device takes well.
     """
-    lanes = lanes_in(policy)
-    if lanes is None:
+    if (lanes := lanes_in(policy)) is None:
         alone = rollout_with_progress(env, policy, key, num_envs, steps, tell)
         return jax.tree.map(lambda leaf: np.asarray(leaf)[None], alone)
     each, shared = _apart(policy)

@@ -150,8 +150,7 @@ def _write_gif(
     def indexed(picture: np.ndarray) -> Image.Image:
         # Pillow's own search is quicker still, but inexact: white turns grey.
         keys = picture.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
-        new = np.unique(keys[nearest[keys] < 0])
-        if len(new):
+        if len(new := np.unique(keys[nearest[keys] < 0])):
             nearest[new] = tree.query(np.stack([new >> 16, new >> 8 & 255, new & 255], axis=-1))[1]
         image = Image.fromarray(nearest[keys].astype(np.uint8))
         image.putpalette(list(palette))

@@ -131,8 +131,7 @@ def kind_from_json(name: str, values: dict[str, Any] | None) -> Any:
 
     Raises as `from_json`, and UserError for a value out of bounds or a kind without options.
     """
-    kind = guidances.guides().get(name)
-    if values is None or kind is None:
+    if values is None or (kind := guidances.guides().get(name)) is None:
         return values
     if kind.config is None:
         raise UserError(f"guidance {name!r} has no options: leave them out")

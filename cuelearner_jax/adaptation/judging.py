@@ -154,8 +154,7 @@ class Judge:
                     steps = int(_length(how.env, policy, start, how.steps))
                     how.pictures.animate(how.env, how.pictures.record(how.env, policy, start, steps)[0], file)
                 is_swapped = bool(jax.random.bernoulli(jax.random.fold_in(start, 1)))
-                answer = how.prefer(*(films[::-1] if is_swapped else films))
-                if answer not in (-1, 0, 1):
+                if (answer := how.prefer(*(films[::-1] if is_swapped else films))) not in (-1, 0, 1):
                     says = f"judge_by gave {format_value(answer)}"
                     raise UserError(f"{says}: give -1 (left), 0 (no difference) or 1 (right)")
                 better = -answer if is_swapped else answer

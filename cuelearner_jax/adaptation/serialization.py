@@ -100,8 +100,7 @@ def from_json(values: dict[str, Any], env: Any, code: Any = None, changes: Any =
 
 def _guidance(values: dict[str, Any], env: Any) -> Guide:
     """Return the guide of a guided policy. Raises UserError if no kind of that name is known."""
-    name = values["guidance"]
-    if name not in guidances.guides():
+    if (name := values["guidance"]) not in guidances.guides():
         advice = "name its code by --guidance package.module:NAME, if you trust that code"
         raise UserError(f"the policy is under a guidance from outside, {name!r}: {advice}")
     sizes, options = configuration.from_json(GuideSizes, values["sizes"]), kind_from_json(name, values["options"])

@@ -50,8 +50,7 @@ class Run:
         name, budget, seeds = best_lane(self.results, (guidance, labels, () if seed is None else (seed,)))
         training = self.trainings[name or [*self.trainings][-1]]
         group = training.group
-        lanes = np.flatnonzero((group.budgets == budget) & np.isin(group.seeds, seeds))
-        if not len(lanes):
+        if not len(lanes := np.flatnonzero((group.budgets == budget) & np.isin(group.seeds, seeds))):
             raise UserError(f"no lane with seed {seed} and {labels} labels was trained")
         agent = training.policies(view_of(group.env)).lane(int(lanes[0]))
         lane = {"guidance": name, "labels": budget, "seed": seeds[0]}

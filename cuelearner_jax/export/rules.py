@@ -87,8 +87,7 @@ def _order(builder: Builder, equation: Any, inputs: list[Operand], shape: Shape,
 @one(*REDUCTIONS)
 def _reduction(builder: Builder, equation: Any, inputs: list[Operand], shape: Shape, kind: str) -> Operand:
     of_numbers, of_bools = REDUCTIONS[equation.primitive.name]
-    op = of_bools if kind == "bool" else of_numbers
-    if not op:
+    if not (op := of_bools if kind == "bool" else of_numbers):
         raise NotImplementedError("bitwise logic of integers")
     if "axes" not in equation.params:
         return builder.add(op, inputs, shape, kind)
@@ -301,8 +300,7 @@ def _gather(builder: Builder, equation: Any, inputs: list[Operand], shape: Shape
     whole = (*rows, *block)
     result: Operand = _take_entries(builder, value, _summed(builder, parts, whole), whole, kind)
     if missed is not None:
-        filling = equation.params["fill_value"]
-        if filling is None:
+        if (filling := equation.params["fill_value"]) is None:
             filling = {"float32": np.nan, "int32": np.iinfo(np.int32).min, "bool": True}[kind]
         result = select(builder, missed, np.asarray(filling, kind), result, whole, kind)
     blocks, others = iter(range(len(rows), len(whole))), iter(range(len(rows)))

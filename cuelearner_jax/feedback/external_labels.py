@@ -59,6 +59,5 @@ def check(labels: Label, spaces: Spaces, form: AnswerForm | None, source: str = 
 
 def _refuse(wrong: np.ndarray, reason: str, remedy: str) -> None:
     """Raise UserError if an entry of any label is wrong: (labels, ...)."""
-    rows = np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))
-    if len(rows):
+    if len(rows := np.flatnonzero(wrong.reshape(len(wrong), -1).any(axis=1))):
         raise UserError(f"{reason} ({len(rows)} of {len(wrong)} labels, the first is number {rows[0] + 1}): {remedy}")

@@ -62,8 +62,7 @@ def aggregates_of(variants: Sequence[Variant], level: float | None, lower_is_bet
     each: dict[tuple[str, str, int], list[Variant]] = {}
     for one in variants:
         each.setdefault((one.run, one.guidance, one.labels), []).append(one)
-    shared = [own for own in each.values() if len(own) == len(tasks)]
-    if not shared:
+    if not (shared := [own for own in each.values() if len(own) == len(tasks)]):
         raise UserError(f"{', '.join(tasks)} share no guidance with equal labels: report each task by itself")
     names = [replace(own[0], task="").name for own in each.values() if own not in shared]
     missing = [f"{name}: not in all tasks, so not among the aggregates" for name in names]

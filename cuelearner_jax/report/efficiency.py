@@ -131,8 +131,7 @@ def _level(variants: Sequence[Variant], question: Question) -> tuple[float, str]
     """Return the level and its origin. Raises UserError if there is none."""
     if question.level is not None:
         return question.level, "given"
-    unguided = next((variant for variant in variants if variant.guidance == "none"), None)
-    if unguided is None:
+    if (unguided := next((variant for variant in variants if variant.guidance == "none"), None)) is None:
         raise UserError("no results of unguided agents, whose level would be the one to reach: give --level")
     steps = unguided.curve.steps
     shared = steps[steps <= max(steps[0], unguided.span[1])]

@@ -76,8 +76,7 @@ def _absent(run: Path, grid: dict[str, Any], table: pa.Table) -> list[str]:
         return [] if below.num_rows else [f"{name}: no results"]
     lines = []
     for kind in grid["guidance"]:
-        rows = below.filter(pc.field("guidance") == kind)
-        if not rows.num_rows:
+        if not (rows := below.filter(pc.field("guidance") == kind)).num_rows:
             lines.append(f"{name}: no results of {kind} guidance")
             continue
         seeds, budgets = (set(rows[column].unique().to_pylist()) for column in ("seed", "labels"))

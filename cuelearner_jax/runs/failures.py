@@ -42,8 +42,7 @@ def without_failed(blocks: Sequence[Any]) -> list[Any]:
         if block.failed.any():
             names = name_lanes(block.seeds[block.failed], block.budgets[block.failed])
             console.print(f"{block.guidance}: {names} failed, no longer finite: left out")
-    rest = [block.lanes(~block.failed) for block in blocks if not block.failed.all()]
-    if not rest:
+    if not (rest := [block.lanes(~block.failed) for block in blocks if not block.failed.all()]):
         raise UserError("all of these lanes failed: there is nothing to evaluate; train again with other settings")
     return rest
 

@@ -142,8 +142,7 @@ def read_labels(
     """Read a label file for a task's world (a configuration) and a grid. Raises UserError if it does not fit."""
     file, env = label_files.read(path), shape_of(task, world)
     _check_world(path, file.task, task, world)
-    asking = [kind for kind in map(guidances.find, grid.guidance) if kind.form is not None]
-    if not asking:
+    if not (asking := [kind for kind in map(guidances.find, grid.guidance) if kind.form is not None]):
         fitting = [kind.name for kind in guidances.guides().values() if kind.form and kind.form.name == file.answers]
         raise UserError(f"--labels-from needs a guidance that uses labels: add --guidance {' or '.join(fitting)}")
     for kind in asking:

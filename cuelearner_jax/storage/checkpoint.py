@@ -97,8 +97,7 @@ class Checkpoints(AbstractContextManager):
 
     def restore(self, like: dict[str, Any]) -> dict[str, Any]:
         """Return the newest checkpoint's items named in `like` (trees of arrays or shapes), on the default device."""
-        number = self.latest()
-        if number is None:
+        if (number := self.latest()) is None:
             raise UserError(f"no checkpoint in {self._folder}: the run was stopped before its first checkpoint")
         device = jax.sharding.SingleDeviceSharding(jax.devices()[0])
         args: dict[str, Any] = {DIGESTS: ocp.args.JsonRestore()}

@@ -212,8 +212,7 @@ def for_lanes(file: LabelFile, seeds: np.ndarray, budgets: np.ndarray, slots: in
     """
     own_seeds, sets = np.unique(file.seeds), []
     for seed, budget in zip(seeds, budgets, strict=True):
-        rows = np.flatnonzero(file.seeds == (own_seeds[0] if len(own_seeds) == 1 else seed))
-        if not len(rows):
+        if not len(rows := np.flatnonzero(file.seeds == (own_seeds[0] if len(own_seeds) == 1 else seed))):
             why = f"the label file has labels for the seeds {format_numbers(own_seeds.tolist())}, none for seed {seed}"
             raise UserError(f"{why}: give --seeds (train: --seed) for these, or the labels of another run")
         if len(rows) < budget:

@@ -47,8 +47,7 @@ def read(path: Path) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], tuple[str
     images = [key for key in cameras[:1] if features[key]["dtype"] == "image"]
     marks = [INTERVENTION] if INTERVENTION in features else []
     columns = [*parts[0], *parts[1], "episode_index", "timestamp", *images, *marks]
-    files = sorted((path / "data").glob("chunk-*/file-*.parquet"))
-    if not files:
+    if not (files := sorted((path / "data").glob("chunk-*/file-*.parquet"))):
         raise _damage_error(path / "data", "no frames")
     table = pa.concat_tables([_parquet(file, columns) for file in files], promote_options="permissive")
     if marks:
@@ -116,8 +115,7 @@ def _entries(features: dict[str, Any], parts: list[str]) -> tuple[str, ...]:
     """Return the names of the parts' entries, one after the other; empty unless each entry has a name of its own."""
     entries = []
     for key in parts:
-        names = _flat(features[key].get("names"))
-        if len(names) != features[key]["shape"][0]:
+        if len(names := _flat(features[key].get("names"))) != features[key]["shape"][0]:
             return ()
         part = key.partition(".")[2]
         entries += [f"{part}: {name}" for name in names] if len(parts) > 1 else names

@@ -70,7 +70,6 @@ def means(row: dict[str, Any]) -> dict[str, float]:
     for name in sorted(name for name in row.keys() - set(LANE) if np.ndim(row[name]) < 2):
         values = np.broadcast_to(np.asarray(row[name], float), budgets.shape)
         for budget in np.unique(budgets):
-            own = values[(budgets == budget) & np.isfinite(values)]
-            if len(own):
+            if len(own := values[(budgets == budget) & np.isfinite(values)]):
                 result[f"{name}/labels_{budget}"] = float(own.mean())
     return result

@@ -244,8 +244,7 @@ class AdaptRequest:
         if shares and by in (LABELS, PERSON):
             raise UserError("judge_bounds needs episodes to be tried on: give --judge-by a metric of the task")
         step = judging.step_of(subject.env)
-        names = ["reward", *step.metrics, *step.outcome, LABELS, PERSON]
-        if by not in names:
+        if by not in (names := ["reward", *step.metrics, *step.outcome, LABELS, PERSON]):
             raise UserError(f"judge_by is {by!r}, which is not a metric of {task.name}{suggestion(by, names)}")
         if by in task.less_is_better:
             raise UserError(f"judge_by is {by!r}, of which less is better: give one of which more is, as reward")

@@ -176,8 +176,7 @@ def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = No
     policy before its correction; None: unknown.
     """
     rows = jax.tree.map(lambda leaf: np.asarray(leaf)[np.asarray(says_something(rows.answer))], rows)
-    answers = np.asarray(rows.answer)
-    if not len(answers):
+    if not len(answers := np.asarray(rows.answer)):
         raise UserError("labels say nothing of any cue: give labels with answers")
     counts = np.asarray(is_answered(answers)) if len(space.cues) > 1 else np.ones(answers.shape, bool)
 

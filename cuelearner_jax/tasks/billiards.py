@@ -39,8 +39,7 @@ def make_teacher(config: BilliardsConfig, env: Any) -> Teacher:
     """Return the teacher of a configuration."""
     aim_error = jnp.deg2rad(jnp.array(config.aim_error_deg, jnp.float32))
     habit = jnp.array(config.habit, jnp.float32)
-    folder = teacher_folder(config)
-    if folder is None:
+    if (folder := teacher_folder(config)) is None:
         return SearchTeacher(env, aim_error, habit, config.search_directions)
     trained_in = _learned_in(folder, config)
     own = make_environment(trained_in)

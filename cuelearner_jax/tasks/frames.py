@@ -131,8 +131,7 @@ def draw_poses(env: JaxEnvironment, poses: Sequence[tuple[Any, Any]]) -> list[Pi
     from cuelearner_envs.anymal.scene import Studio
 
     library: Any = mujoco  # whose compiled module has no stubs
-    model = model_of(env.simulator())
-    if model is None:
+    if (model := model_of(env.simulator())) is None:
         raise UserError("this environment has no MuJoCo model to draw: evaluate a policy in it instead")
     camera = library.MjvCamera()
     library.mjv_defaultFreeCamera(model, camera)

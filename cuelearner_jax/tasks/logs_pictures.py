@@ -33,8 +33,7 @@ def _frames(env: Any, row: Any) -> tuple[list[Any], int, float]:
     if not env.path:
         raise UserError("these situations are those of labels, without pictures: name their folder, as logs:FOLDER")
     place = int(env.places[row])
-    picture = situations.read_once(Path(env.path)).picture(place)
-    if picture is None:
+    if (picture := situations.read_once(Path(env.path)).picture(place)) is None:
         return [BLANK], place, 0.0
     if picture.kind.startswith("image/") and picture.kind != "image/gif":
         return [picture.data], place, 0.0

@@ -28,8 +28,7 @@ def folder_of(name: str | os.PathLike[str]) -> Path:
     """
     if not is_shipped(name):
         return Path(name)
-    text = os.fspath(name)
-    if text not in names():
+    if (text := os.fspath(name)) not in names():
         raise UserError(f"no shipped agent {text!r}: give one of {', '.join(names())}")
     return _place() / text.removeprefix(PREFIX)
 

@@ -294,8 +294,7 @@ class Instances:
         inner = lambda each: getattr(each.env, "unwrapped", each.env)  # noqa: E731
         if any(inner(one) is inner(other) for other in self.running):
             raise UserError(f"{one.whose} is the same instance each time: let the function make a new environment")
-        size = sum(leaf.size for leaf in one.leaves)
-        if size != self.size:
+        if (size := sum(leaf.size for leaf in one.leaves)) != self.size:
             advice = "name the environment anew"
             raise UserError(f"{one.whose} has observations of {size} entries, its task says {self.size}: {advice}")
         self.running.append(one)
