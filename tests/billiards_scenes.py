@@ -29,14 +29,12 @@ SCENE = balls([(-0.2, 0.0), (0.1, -0.1), (0.3, 0.1), (0.0, 0.1)])
 
 def random_states():
     """States of play, in three of four one target (of any number) has been taken off; half the strikes hit a ball."""
-    keys = jax.random.split(jax.random.key(5), BATCH)
-    states, _ = reset_many(EASY, keys)
+    states, _ = reset_many(EASY, jax.random.split(jax.random.key(5), BATCH))
     for number in range(3):
         key = jax.random.fold_in(KEY, number)
         states, _ = step_many(EASY, jax.random.split(key, BATCH), states, directions.uniform(key, (BATCH,)))
     ball = jnp.arange(4)[None]
-    taken = (jnp.arange(BATCH)[:, None] % 4 == ball) & (ball > 0)
-    states = states.replace(pocketed=states.pocketed | taken)
+    states = states.replace(pocketed=states.pocketed | ((jnp.arange(BATCH)[:, None] % 4 == ball) & (ball > 0)))
     closest = jax.jit(jax.vmap(EASY.heuristic))(observe_many(EASY, states))
     strikes = jnp.where(jnp.arange(BATCH)[:, None] % 8 < 4, closest, directions.uniform(jax.random.key(6), (BATCH,)))
     return states, strikes

@@ -25,8 +25,7 @@ class Adder(gymnasium.Env):
     def step(self, action):
         self.total += float(action[0])
         self.steps += 1
-        info = {"is_success": self.total > 1.5}
-        return self._obs(), float(action[0]), self.total > 1.5, self.steps >= 6, info
+        return self._obs(), float(action[0]), self.total > 1.5, self.steps >= 6, {"is_success": self.total > 1.5}
 
     def _obs(self):
         return np.array([self.total, self.steps])

@@ -24,8 +24,7 @@ def model(world: NavigationWorld) -> mujoco.MjModel:
     for (x, y, radius), height in _used(world.circles, world.circle_heights):
         geoms.append(f'<geom type="cylinder" pos="{x!r} {y!r} {height / 2!r}" size="{radius!r} {height / 2!r}"/>')
     solids = "\n".join(geoms)
-    xml = f'<mujoco><compiler angle="radian"/><worldbody>{solids}</worldbody></mujoco>'
-    return mujoco.MjModel.from_xml_string(xml)
+    return mujoco.MjModel.from_xml_string(f'<mujoco><compiler angle="radian"/><worldbody>{solids}</worldbody></mujoco>')
 
 
 def settled(model: mujoco.MjModel) -> mujoco.MjData:

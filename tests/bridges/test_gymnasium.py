@@ -28,8 +28,7 @@ def closed():
 
 
 def world(env, max_steps=6, **settings):
-    limit = {} if isinstance(env, str) else {"max_steps": max_steps}
-    return cl.from_gymnasium(env, processes=1, **limit, **settings)
+    return cl.from_gymnasium(env, processes=1, **({} if isinstance(env, str) else {"max_steps": max_steps}), **settings)
 
 
 def same(found, wanted):

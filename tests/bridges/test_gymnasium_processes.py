@@ -106,8 +106,7 @@ def test_pictures_are_of_the_state_that_is_shown(tmp_path):
     clip = pictures.reel(env, states[2], jnp.float32([-0.5]))
     assert (len(clip.pictures), clip.words) == (5, "held for 4 steps")  # the episode ends by time after six
     frames, rewards = pictures.record(env, uniform_in(env), KEY, 9)
-    shown = [int(frame[0, 0, 0]) // 20 for frame in frames]
-    assert shown == [*range(7), *range(4)]
+    assert [int(frame[0, 0, 0]) // 20 for frame in frames] == [*range(7), *range(4)]
     assert len(rewards) == 9
     pictures.question(env, states[2], None, jnp.float32([-0.5]), tmp_path / "question.png")
     assert Image.open(tmp_path / "question.png").size == (48, 16)

@@ -27,8 +27,7 @@ def test_the_arm_comes_nearer_and_its_situations_can_be_labelled(made):
     assert found.observations.shape == (120, 3)
     with Image.open(folder / "situations/pictures/0.png") as picture:
         assert picture.size == (logs_of_an_arm.PIXELS, logs_of_an_arm.PIXELS)
-    again = cl.load_policy(folder / "policy", base=logs_of_an_arm.arm)
-    assert np.isfinite(again(found.observations)).all()
+    assert np.isfinite(cl.load_policy(folder / "policy", base=logs_of_an_arm.arm)(found.observations)).all()
 
 
 @pytest.mark.long
@@ -38,8 +37,7 @@ def test_the_arm_is_a_quarter_as_wrong_after_all_rounds(tmp_path):
 
 
 def test_the_node_corrects_what_the_base_says_and_passes_it_on_in_doubt(made):
-    folder = made[0]
-    beside = ros2_correction.Beside(folder / "correction")
+    beside = ros2_correction.Beside(made[0] / "correction")
     obs = np.array([0.1, -0.05, 0.03], np.float32)
     base = logs_of_an_arm.arm(obs[None])[0]
     np.testing.assert_allclose(beside.action(base, 1.0), base, rtol=1e-6)

@@ -82,8 +82,7 @@ def test_one_update_of_double_dqn():
         rest = rest.replace(target_params=double_dqn.init(jax.random.key(1))[0])
         steps = StoredStep(obs, action, reward, goes_on[:, None], goes_on[:, None], obs[::-1])
         buffer = RingBuffer(jax.tree.map(lambda leaf: leaf[0], steps))
-        rows = buffer.add(buffer.empty(40), jnp.array(0), steps)
-        memory = Memory(ENV, buffer, rows, jnp.array(40), 10, True)
+        memory = Memory(ENV, buffer, buffer.add(buffer.empty(40), jnp.array(0), steps), jnp.array(40), 10, True)
         targets = double_dqn.targets(ENV, options, discount, params, rest.target_params, memory.batches(key, 8))
         learned, after, loss, _ = double_dqn.update(ENV, options, scalars, jnp.array(2), params, rest, memory, key)
         return (learned, after.target_params), targets, loss

@@ -74,8 +74,7 @@ def test_a_policy_in_a_space_of_ones_own_is_exported_and_adapted(run, tmp_path, 
     assert main(["export", run, *NAMED, "--format", "numpy", "--out", str(decision)]) == 0
     told = json.loads((decision / runner.CONTRACT).read_text())["action"]
     assert (told["name"], told["space"]) == ("grasp", WRIST.to_json())
-    obs = np.asarray(jax.vmap(Lids().reset)(jax.random.split(jax.random.key(1), 5))[1])
-    found = runner.Decision(decision)(obs)
+    found = runner.Decision(decision)(np.asarray(jax.vmap(Lids().reset)(jax.random.split(jax.random.key(1), 5))[1]))
     np.testing.assert_allclose(WRIST.retract(jnp.asarray(found)), found, atol=1e-6)
     capsys.readouterr()
     adapted = ["adapt", run, *NAMED, "--scenario", "loose_mount", "--labels", "20", "--judge-episodes", "20"]

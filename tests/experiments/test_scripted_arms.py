@@ -20,8 +20,7 @@ def observed(**places):
 
 
 def test_the_scripts_do_what_they_say():
-    far = reach(observed(goal=(1, 0, 0), gripper=(0, 0.01, 0)))
-    np.testing.assert_allclose(far, [[1, -0.2, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(reach(observed(goal=(1, 0, 0), gripper=(0, 0.01, 0))), [[1, -0.2, 0, 0]], atol=1e-6)
     at = {"goal": (0.3, 0, 0.4), "thing": (0, 0, 0.4)}
     np.testing.assert_array_equal(push(observed(**{**at, "goal": (0.005, 0, 0.4)}, gripper=(-0.1, 0, 0.4))), 0)  # done
     pushes = np.asarray(push(observed(**at, gripper=(-0.06, 0, 0.4))))[0]

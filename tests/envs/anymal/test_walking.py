@@ -22,8 +22,7 @@ def test_the_network_is_the_mean_of_braxs_policy():
     seen = running_statistics.init_state(specs.Array((policy.OBS,), jnp.dtype("float32")))
     obs = jax.random.normal(jax.random.key(1), (64, policy.OBS)) * 3 + 1
     seen = running_statistics.update(seen, obs)
-    weights = made.policy_network.init(jax.random.PRNGKey(0))
-    params = (seen, weights, None)
+    params = (seen, made.policy_network.init(jax.random.PRNGKey(0)), None)
     wanted, _ = networks.make_inference_fn(made)(params, deterministic=True)(obs, jax.random.PRNGKey(2))
     np.testing.assert_allclose(policy.from_brax(params)(obs), wanted, atol=1e-5)
 

@@ -33,8 +33,7 @@ def told(action, gripper=HIGH, fingers=(0.0, 0.0), post=0.0, grasps=1.0):
 
 @pytest.mark.long
 def test_the_task_keeps_its_laws(tmp_path):
-    small = ArmConfig(skill="reach", max_steps=5, camera_offset=(0.0, 0.02, 0.0))
-    check_task(ARM, small, steps=12, pictures=tmp_path)
+    check_task(ARM, ArmConfig(skill="reach", max_steps=5, camera_offset=(0.0, 0.02, 0.0)), steps=12, pictures=tmp_path)
 
 
 def test_an_action_of_1_is_5_cm_and_opens_the_fingers():
@@ -78,8 +77,7 @@ def test_a_declared_family_names_the_turn_and_the_offset(skill):
     world, plain = ARM.environment(config), ARM.environment(ARM.configure(skill=skill))
     state, true = plain.reset(jax.random.key(3))
     family = declared_distortions(world)
-    names = [one.name for one in family]
-    assert [name.rpartition(": ")[2] for name in names] == ["shift", "gain", "turn"]
+    assert [one.name.rpartition(": ")[2] for one in family] == ["shift", "gain", "turn"]
     # The camera turns first, then shifts; a family undoes in the other order.
     found = undo_observation((family[0], family[2]), jnp.array([0.01, -0.02, 0.03, 10.0]), world.observe(state))
     assert np.abs(world.observe(state) - true).max() > 0.05
@@ -91,8 +89,7 @@ def test_the_teacher_sees_true_places_and_the_heuristic_what_is_seen():
     env = ARM.environment(config)
     state, obs = env.reset(jax.random.key(1))
     teacher = ARM.make_teacher(config, env)
-    true = env.observe(state, Camera())
-    assert np.allclose(teacher.best_action(state, obs), act("reach", true[None])[0])
+    assert np.allclose(teacher.best_action(state, obs), act("reach", env.observe(state, Camera())[None])[0])
     assert np.allclose(env.heuristic(obs), act("reach", obs[None])[0])
     assert not np.allclose(teacher.best_action(state, obs), env.heuristic(obs), atol=0.1)
 

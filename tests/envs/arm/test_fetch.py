@@ -20,8 +20,7 @@ ACTIONS = np.array([[1.0, 0.5, 0.5, 1.0], [-1.0, 0.0, 0.25, 0.0], [0.1, -1.0, 1.
 def here(config):
     """The environment of a configuration, played in this process."""
     env: Any = arm.make_fetch(config)
-    source = dataclasses.replace(env.plays.source, processes=1)
-    return env.replace(plays=env.plays.replace(source=source))
+    return env.replace(plays=env.plays.replace(source=dataclasses.replace(env.plays.source, processes=1)))
 
 
 def fetchs_own(name, seed, actions):

@@ -58,8 +58,7 @@ def test_a_mirrored_table_mirrors_strikes_and_keeps_features(which):
 
 def test_a_pocketed_ball_is_no_aim_and_in_nobodys_way():
     between = SEEN.at[6:9].set(jnp.array([-0.1, 0.075, -0.5]))  # on the way from the cue ball to the first target
-    gone = between.at[8].set(0.5)
-    blocked, free = (by_ball(aims_seen(REGULATION, seen)) for seen in (between, gone))
+    blocked, free = (by_ball(aims_seen(REGULATION, seen)) for seen in (between, between.at[8].set(0.5)))
     assert not free[2][1].any()
     # clearance of the cue ball's way, in diameters, less 1
     assert blocked[1][0, UP, 7] < -0.5 < 0.9 < free[1][0, UP, 7]

@@ -71,8 +71,7 @@ def test_a_foul_puts_every_ball_back_and_the_cue_ball_somewhere_free_on_the_left
     cue, edge = np.asarray(after.positions[:, 0]), 0.02 + 0.004  # a ball's and a cushion's radius
     assert (cue >= [-0.4 + edge - 1e-6, -0.2 + edge - 1e-6]).all()
     assert (cue <= [-0.2, 0.2 - edge + 1e-6]).all()
-    gaps = np.linalg.norm(cue[:, None] - np.asarray(FOUL.positions[1:]), axis=-1)
-    assert gaps.min() >= 2 * 0.02 - 1e-6
+    assert np.linalg.norm(cue[:, None] - np.asarray(FOUL.positions[1:]), axis=-1).min() >= 2 * 0.02 - 1e-6
     assert (cue.max(0) - cue.min(0) > [0.16, 0.33]).all()  # all over the quarter of 0.176 m x 0.352 m
 
 
@@ -88,8 +87,7 @@ def test_a_foul_takes_back_what_the_same_shot_pocketed():
 
 def test_a_cleared_table_terminates_and_a_new_rack_follows():
     for shots in (3, 9):  # 9: also the last shot of the episode
-        last = balls(CORNER.positions, (False, False, True, True), shots)
-        after, result = step(EASY, KEY, last, CORNERWARDS)
+        after, result = step(EASY, KEY, balls(CORNER.positions, (False, False, True, True), shots), CORNERWARDS)
         assert float(result.reward) == 1.0
         assert (bool(result.terminated), bool(result.truncated)) == (True, False)
         final = np.asarray(result.final_obs).reshape(4, 3)

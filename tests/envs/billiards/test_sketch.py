@@ -28,8 +28,7 @@ def test_balls_and_the_arrow_are_where_they_should_be_with_y_downwards():
     x, y, wide, high = (float(frame.get(name)) for name in ("x", "y", "width", "height"))
     assert left < x < x + wide < left + width
     assert top < y < y + high < top + height
-    holes = [one for one in whole.iter("rect") if "15110e" in one.get("style")]
-    assert len(holes) == 4
+    assert len([one for one in whole.iter("rect") if "15110e" in one.get("style")]) == 4
     radii = [float(ElementTree.fromstring(f"<g>{body}</g>")[0].get("r")) for body in found.movers.values()]
     assert radii == [0.02, 0.02]
     gone = sketch(ENV, balls([[0.1, -0.1], [0.3, 0.15]], (False, True)))

@@ -21,8 +21,7 @@ ENV = Navigation(worlds=jax.tree.map(lambda leaf: leaf[None], room([[-5.5, 2.0]]
 @pytest.fixture(scope="module")
 def frames():
     """Frames of walking straight toward the goal, into a box."""
-    steps = record(ENV, Heuristic(ENV), jax.random.key(1), 40)[0]
-    return [frame for frame in steps if frame.episode == 0]
+    return [frame for frame in record(ENV, Heuristic(ENV), jax.random.key(1), 40)[0] if frame.episode == 0]
 
 
 def looker(image, dpi=160):

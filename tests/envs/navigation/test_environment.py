@@ -80,8 +80,7 @@ def test_features_turn_what_is_seen_to_the_direction():
     np.testing.assert_allclose(left[SEEN_PREVIOUS], [0, -1, 1, 0, 0.8, -0.6], atol=1e-5)
     half = features(HALL, obs, degrees(20.5)).turned
     np.testing.assert_allclose(half[AHEAD_OF_IT], (obs[155] + obs[156]) / 2, atol=1e-4)
-    along = float(jnp.dot(obs[GOAL], degrees(20.5)))
-    np.testing.assert_allclose(half[SEEN_GOAL.start], along, atol=1e-5)
+    np.testing.assert_allclose(half[SEEN_GOAL.start], float(jnp.dot(obs[GOAL], degrees(20.5))), atol=1e-5)
 
 
 def outcome(result):

@@ -31,8 +31,7 @@ def test_clearance_by_hand():
     places = [[0.0, 0.0], [0.2, 2.4], [1.0, 0.0], [1.4, 0.0], [-3.0, 0.25], [-1.0, 0.0], [1.5, 1.0]]
     # beside the box; 0.3 and 0.4 off its corner; in its middle, 0.5 from the nearest side; 0.1 inside; in the circle,
     # 0.25 off its centre; halfway nearer the circle; on a side.
-    expected = [0.5, 0.5, -0.5, -0.1, -0.75, 1.0, 0.0]
-    np.testing.assert_allclose(clearances(one, jnp.array(places)), expected, atol=1e-6)
+    np.testing.assert_allclose(clearances(one, jnp.array(places)), [0.5, 0.5, -0.5, -0.1, -0.75, 1.0, 0.0], atol=1e-6)
 
 
 def test_line_clearance_by_hand():
@@ -43,5 +42,4 @@ def test_line_clearance_by_hand():
     # point 0.3 and 0.4 off the corner; slanting past the corner (1, 0.5): the line x + 4 y = 6 is 3 / sqrt(17) away
     # from it, and 10 / sqrt(17) from the circle's centre; within the box.
     expected = [0.5, 0.0, 1.0, 1.0, -0.5, 0.5, 3 / math.sqrt(17), 0.0]
-    got = line_clearances(one, jnp.array(starts), jnp.array(ends))
-    np.testing.assert_allclose(got, expected, atol=1e-6)
+    np.testing.assert_allclose(line_clearances(one, jnp.array(starts), jnp.array(ends)), expected, atol=1e-6)

@@ -126,8 +126,7 @@ def ways(teacher, index, route, positions):
 
 def free_places(world, seed, count=ASKED, spare=0.01):
     """Random places at which the body may turn and a line need not come closer to a solid."""
-    rng = np.random.default_rng(seed)
-    places = rng.uniform(-0.5, 0.5, (2000, 2)) * world.extent
+    places = np.random.default_rng(seed).uniform(-0.5, 0.5, (2000, 2)) * world.extent
     return places[clear_of(world, places) >= NEEDED + spare][:count].astype(np.float32)
 
 
@@ -188,7 +187,6 @@ def test_the_way_through_the_gap_is_as_long_as_it_has_to_be(teacher):
     # of the wall's end, 0.2 m between the arcs, which together turn by twice 43.93 degrees.
     shortest = 2 * math.sqrt(3.9**2 + 3.0**2 - NEEDED**2) + 0.2 + NEEDED * math.radians(2 * 43.93)
     for index, side in GATES.items():
-        places = jnp.tile(jnp.array([-4.0, 0.0]), (ASKED, 1))
-        following, length = ways(teacher, index, 0, places)
+        following, length = ways(teacher, index, 0, jnp.tile(jnp.array([-4.0, 0.0]), (ASKED, 1)))
         assert shortest - 1e-3 < float(length[0]) < 1.1 * shortest
         assert 3.0 < side * float(following[0, 1]) < 5.0

@@ -71,5 +71,4 @@ def test_the_body_collides_with_a_post_to_the_millimetre(pose, contact):
 
 def test_outside_the_walls_counts_as_a_collision():
     poses = jnp.array([[-4.99, 0.0, 0.0], [-5.01, 0.0, 0.0], [0.0, 4.99, 0.0], [0.0, 5.01, 0.0], [20.0, 0.0, 0.0]])
-    nothing = world(extent=(10.0, 10.0))
-    np.testing.assert_array_equal(touches(Robot(), nothing, poses), [False, True, False, True, True])
+    np.testing.assert_array_equal(touches(Robot(), world(extent=(10.0, 10.0)), poses), [False, True, False, True, True])

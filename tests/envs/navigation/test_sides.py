@@ -35,8 +35,7 @@ STEPS = [  # ahead, before, after, (passed on the left, on the right)
 
 @pytest.mark.parametrize(("ahead", "before", "after", "counted"), STEPS)
 def test_an_obstacle_is_passed_where_the_line_through_its_middle_is_crossed_forward(ahead, before, after, counted):
-    found = passes(WORLD, jnp.float32(ahead), jnp.array(before), jnp.array(after))
-    np.testing.assert_array_equal(found, counted)
+    np.testing.assert_array_equal(passes(WORLD, jnp.float32(ahead), jnp.array(before), jnp.array(after)), counted)
 
 
 def test_a_closed_side_lets_nothing_through_and_the_other_stays_open():
