@@ -209,8 +209,7 @@ def label_rounds(guidance, sizes):
     """`asking.label_round` of a guidance, compiled."""
 
     def one(env, teacher, scalars, base, guide, lane_key):
-        of = asking.Inquiry(guidance, env, scalars, base)
-        return asking.label_round(of, sizes, teacher, guide, lane_key)
+        return asking.label_round(asking.Inquiry(guidance, env, scalars, base), sizes, teacher, guide, lane_key)
 
     return jax.jit(one)
 

@@ -116,8 +116,7 @@ def test_the_share_is_twice_the_chance_that_guidance_is_better():
 
 def test_few_episodes_that_went_alike_are_not_believed_for_certain():
     # Three guided failures against own luck of 0.3: by their own variance (0) guidance were worse for certain.
-    counts = sums((200, 60), (3, 0))
-    assert float(pace.guided_share(counts, HALF)) > 0.1
+    assert float(pace.guided_share(sums((200, 60), (3, 0)), HALF)) > 0.1
 
 
 @partial(jax.jit, static_argnames="episodes")

@@ -126,8 +126,7 @@ def test_answers_past_the_budget_do_not_count():
     assert np.asarray(guide.labels.valid).tolist() == [True] * 4 + [False] * (2 * ROUND - 4)
     # The round beyond a spent budget leaves everything as it is, the model too.
     spent = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), begun(budget=ROUND), LANE_KEY)
-    after = label_round(ENV, EXPERT, probes.SCALARS, Uniform(), spent, LANE_KEY)
-    chex.assert_trees_all_equal(after, spent)
+    chex.assert_trees_all_equal(label_round(ENV, EXPERT, probes.SCALARS, Uniform(), spent, LANE_KEY), spent)
 
 
 def test_shuffled_answers_are_those_given_each_with_another_label():
@@ -146,8 +145,7 @@ def test_shuffled_answers_are_those_given_each_with_another_label():
     pairs = labels.replace(answer=jnp.concatenate([labels.answer, labels.answer + 0.5], -1))  # the second actions stay
     exchanged = asking.fitted_labels(LANE_KEY, pairs, scalars, PREFERENCE).answer
     np.testing.assert_array_equal(exchanged, np.concatenate([found, answer + 0.5], -1))
-    other = asking.fitted_labels(jax.random.key(12), labels, scalars)
-    assert (np.asarray(other.answer) != found).any()
+    assert (np.asarray(asking.fitted_labels(jax.random.key(12), labels, scalars).answer) != found).any()
 
 
 class Lidar(probes.Window):

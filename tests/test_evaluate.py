@@ -71,8 +71,7 @@ def test_a_roll_out_in_stretches_is_bitwise_that_in_one(steps):
 def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     """Three lanes, one, two or all at a time."""
     monkeypatch.setattr(evaluate, "portions", lambda: Portions(actions=8192, agents=at_once, states=16, passes=1))
-    program = probes.window_program("none")
-    agents = Agent(probes.start(program, [0, 1, 2], [0, 0, 0]).agent.params, probes.FUNCTIONS)
+    agents = Agent(probes.start(probes.window_program("none"), [0, 1, 2], [0, 0, 0]).agent.params, probes.FUNCTIONS)
     told = []
     watched = evaluate.rollout_lanes(ENV, agents, KEY, 10, 120, lambda *given: told.append(given))
     whole = evaluate.rollout_lanes(ENV, agents, KEY, 10, 120, mesh=lane_mesh(jax.local_devices()[:1])).means

@@ -24,8 +24,7 @@ BUDGETS = [10, 20]
 @cache
 def labelled(kind):
     """Two lanes of one seed after all their labels, and the guide's state as NumPy arrays."""
-    guide = guidances.make(kind, CONFIG.sizes, ENV)
-    program = make_program(CONFIG, guide, ENV, max(BUDGETS))
+    program = make_program(CONFIG, guidances.make(kind, CONFIG.sizes, ENV), ENV, max(BUDGETS))
     clock, state = start_clock(), probes.start(program, [3, 3], BUDGETS)
     for _ in range(2):
         clock, state = program.label_round(ENV, EXPERT, probes.SCALARS, clock, state)

@@ -65,8 +65,7 @@ def test_the_agent_learns_a_bandit_by_itself():
 
 def reward_of(params):
     key = jax.random.key(7)
-    agents = Agent(params, probes.FUNCTIONS)
-    measured = evaluate.rollout_lanes(ENV, agents, key, 40, 80, mesh=MESH).means
+    measured = evaluate.rollout_lanes(ENV, Agent(params, probes.FUNCTIONS), key, 40, 80, mesh=MESH).means
     np.testing.assert_array_equal(measured["reward"], measured["hit"])
     return np.asarray(measured["reward"])
 
@@ -222,8 +221,7 @@ def test_a_step_beyond_all_numbers_is_taken_back():
     state = probes.start(program, [0], [0])
     fresh = jax.tree.map(jnp.copy, state.agent)
     # In the last iteration alone: nothing looks at its parameters after that.
-    settings = replaced(learning_rate=3e38, learn_after=48)
-    _, state, _ = run(program, settings, loop.start_clock(), state)
+    _, state, _ = run(program, replaced(learning_rate=3e38, learn_after=48), loop.start_clock(), state)
     assert state.failed.all()
     assert_equal(state.agent.params, fresh.params)
     assert_equal(state.agent.training, fresh.training)

@@ -125,8 +125,7 @@ def test_a_function_is_called_whatever_surrounds_it(name):
     direct = called / np.linalg.norm(called, axis=-1, keepdims=True)
     np.testing.assert_allclose(direct, directions.rotate(OBS, 0.5), atol=1e-6)
     np.testing.assert_allclose(act(policy), direct, atol=1e-6)
-    compiled = jax.jit(lambda policy, obs: policy.act(KEY, obs, obs))
-    np.testing.assert_allclose(compiled(policy, OBS), direct, atol=1e-6)
+    np.testing.assert_allclose(jax.jit(lambda policy, obs: policy.act(KEY, obs, obs))(policy, OBS), direct, atol=1e-6)
     lanes = OBS.reshape(4, 10, 2)
     many = jax.jit(jax.vmap(lambda obs: policy.act(KEY, obs, obs)))
     np.testing.assert_allclose(many(lanes), direct.reshape(4, 10, 2), atol=1e-6)
@@ -172,8 +171,7 @@ def test_a_function_of_more_than_observations_is_refused_with_the_call_that_woul
 def test_a_finished_agent_teaches_what_it_does():
     teacher = Teaching(AGENT)
     expected = act(AGENT)
-    one = np.stack([teacher.best_action(state, state) for state in OBS[:5]])
-    np.testing.assert_array_equal(one, expected[:5])
+    np.testing.assert_array_equal(np.stack([teacher.best_action(state, state) for state in OBS[:5]]), expected[:5])
     np.testing.assert_array_equal(act(Taught(teacher)), expected)
     # A policy that looks at the state sees it.
     np.testing.assert_allclose(act(Taught(Teaching(Taught(EXPERT)))), BEST, atol=1e-6)

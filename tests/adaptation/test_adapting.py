@@ -112,8 +112,7 @@ def test_the_bound_is_never_exceeded():
         assert away[:10].max() < 1e-3  # the first round is about its own actions
         assert away[10:].max() > 4.0  # later ones about refined ones
     # However wild the model.
-    wild = block.replace(guide=block.guide.replace(model=jax.tree.map(_blown, block.guide.model)))
-    policy = of().policy(wild)
+    policy = of().policy(block.replace(guide=block.guide.replace(model=jax.tree.map(_blown, block.guide.model))))
     everywhere = directions.evenly_spaced(100)
     for lane, bound in enumerate(LANES.bound_deg):
         base = Shifted(jnp.array(SHIFTS[LANES.base[lane]]))
@@ -145,8 +144,7 @@ def test_budgets_are_masks_and_lanes_do_not_know_each_other():
 
 
 def test_given_labels_lead_where_asking_for_them_did():
-    labels = found().labels
-    given = by_model.adapt(of(), LANES, JUDGING, labels=labels, mesh=MESH)
+    given = by_model.adapt(of(), LANES, JUDGING, labels=found().labels, mesh=MESH)
     chex.assert_trees_all_equal(given.block.guide.model, found().block.guide.model)
     np.testing.assert_array_equal(given.judgement.after, found().judgement.after)
 

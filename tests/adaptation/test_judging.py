@@ -25,8 +25,7 @@ def test_a_better_policy_is_accepted_and_a_worse_one_rejected():
 
 def test_a_tie_is_never_used():
     for chance in (0.0, 1.0):
-        test = judged(chance, chance, lanes=20)
-        assert not test.decided.any()
+        assert not judged(chance, chance, lanes=20).decided.any()
 
 
 def test_of_policies_that_are_as_good_one_in_twenty_at_most_is_accepted():

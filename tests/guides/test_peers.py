@@ -145,8 +145,7 @@ def test_the_loss_has_the_gradient_of_the_papers_divergence():
 
 def test_the_least_energy_lies_on_the_corrected_side():
     guide = made("clic")
-    answer = jnp.array([1.0, -1.0, UNSAID])
-    told = labels(jnp.tile(MIDDLE, (10, 1)), jnp.tile(answer, (10, 1)))
+    told = labels(jnp.tile(MIDDLE, (10, 1)), jnp.tile(jnp.array([1.0, -1.0, UNSAID]), (10, 1)))
     scalars = dataclasses.replace(SCALARS, feedback_learning_rate=1e-2)
     model = jax.jit(guide.fit)(KEY, ENV, told, guide.init(KEY), scalars)
     acted = jax.jit(guide.act)(model, ENV, SEEN, jnp.tile(MIDDLE, (2, 1)), jnp.ones(2, bool), scalars)
@@ -196,8 +195,7 @@ def test_the_human_model_leads_the_policy_by_eps_at_most_and_along_all_cues():
     np.testing.assert_allclose(still.target, acted, atol=1e-6)  # it says "already right"
     assert still.cues.all()
     loud = jax.tree.map(lambda leaf: jnp.full_like(leaf, 9.0) if leaf.shape == (3,) else leaf, params)
-    moved = targets(ENV, loud, rows, acted, SCALARS)
-    np.testing.assert_allclose(log(acted, moved.target), SCALARS.eps_deg, rtol=1e-5)
+    np.testing.assert_allclose(log(acted, targets(ENV, loud, rows, acted, SCALARS).target), SCALARS.eps_deg, rtol=1e-5)
 
 
 def test_the_human_model_is_taught_answers_and_nothing_of_other_cues():
@@ -207,5 +205,4 @@ def test_the_human_model_is_taught_answers_and_nothing_of_other_cues():
     told = [[1.0, UNSAID, UNSAID], [1.0, 0.0, UNSAID], [1.0, -1.0, 0.0]]
     examples, loss = jax.jit(guide.examples), jax.jit(guide.human_loss)
     rows = [examples(labels(MIDDLE[None], jnp.array([answer])), SCALARS) for answer in told]
-    found = [float(loss(ENV, params, row, SCALARS)) for row in rows]
-    np.testing.assert_allclose(found, [1.0, 1.0, 2.0], rtol=1e-4)
+    np.testing.assert_allclose([float(loss(ENV, params, row, SCALARS)) for row in rows], [1.0, 1.0, 2.0], rtol=1e-4)

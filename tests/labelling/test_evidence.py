@@ -45,8 +45,7 @@ def test_the_estimate_narrows_the_page_shows_it_and_the_policy_follows(opened):
     assert ends[1] < ends[0]
     assert abs(mean - 34.4) < 12
     item = session.item
-    best = np.asarray(ENV.best(item.guide.obs))
-    assert float(item.refined @ best) > np.cos(np.deg2rad(12))
+    assert float(item.refined @ np.asarray(ENV.best(item.guide.obs))) > np.cos(np.deg2rad(12))
     shown(session, acts)
 
 

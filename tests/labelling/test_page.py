@@ -34,8 +34,7 @@ def test_buttons_answer_what_is_on_the_page_and_it_tells_how_far_it_is(opened, t
         await user.should_see("0 of 20")
         await user.should_see("Which way should the middle arrow turn?")
         for number in range(10):
-            right = expert(session.item)
-            told.append(float(right[0]))
+            told.append(float(expert(session.item)[0]))
             await press(user, words[told[-1]], lambda number=number: session.number == number + 1)
         await user.should_see("10 of 20")
         await press(user, "unsure", lambda: session.number == 11)
@@ -88,8 +87,7 @@ def test_an_answer_names_its_item_and_when_all_is_answered_the_page_says_so(open
 def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
     five = AnswerForm("five", lambda _: 1, lambda _: "worth", lambda *told: None, lambda _: (0.0, 0.25, 0.5, 0.75, 1.0))
     for form in (RELATIVE, DEMONSTRATION, SCALAR, five):
-        known = controls.controls(form, DIRECTIONS)
-        keys = [key for control in known.values() for key in control.keys]
+        keys = [key for control in controls.controls(form, DIRECTIONS).values() for key in control.keys]
         assert len(keys) == len(set(keys)) >= 5
         answers = [control.answer for control in controls.answers(form, DIRECTIONS)]
         assert sorted(answers) == sorted((value,) for value in (form.values(DIRECTIONS) if form.values else ()))
@@ -100,8 +98,7 @@ def test_keys_are_told_apart_and_every_answer_is_one_of_the_form():
 
 def test_every_page_ends_where_it_says_what_was_saved(opened, tmp_path):
     session, stopping = opened(), threading.Event()
-    commands = Commands("cuelearner label mine", lambda labels: f"cuelearner train <{labels}>")
-    site = server.Site(commands, stopping)
+    site = server.Site(Commands("cuelearner label mine", lambda labels: f"cuelearner train <{labels}>"), stopping)
     site.session = session
     app = FastAPI()
     app.add_route(server.FINISHED, site.last_page)

@@ -82,8 +82,7 @@ def test_pairs_of_a_page_are_those_of_a_simulated_teacher_and_train_an_agent(ope
     assert comparing.between(file, other).count == 0  # of the same first actions, but other pairs
     train = ["train", OWN, "--preset", "paper", "--labels", "10", "--labels-from", labels, "--guidance"]
     assert main([*train, "preference", "--out", str(tmp_path / "run")]) == 0
-    again = label_files.read(tmp_path / "run" / "preference")
-    np.testing.assert_array_equal(again.labels.answer, file.labels.answer)
+    np.testing.assert_array_equal(label_files.read(tmp_path / "run" / "preference").labels.answer, file.labels.answer)
     assert main([*train, "relative", "--out", str(tmp_path / "no")]) == 2
     assert "holds preference answers, but guidance relative needs relative answers" in capsys.readouterr().err
     assert main(["labels", "inspect", labels, "--teacher"]) == 0

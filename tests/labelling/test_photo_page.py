@@ -85,16 +85,14 @@ def test_one_press_about_one_cue_says_nothing_of_the_others():
 
 
 def test_entries_that_no_cue_names_are_not_asked_about():
-    cues = cues_from("grip=open,close", ("pan", "lift", "grip"))
-    space = Box((-1.0,) * 3, (1.0,) * 3, cues)
+    space = Box((-1.0,) * 3, (1.0,) * 3, cues_from("grip=open,close", ("pan", "lift", "grip")))
     known = controls.controls(RELATIVE, space)
     assert {one.cue for one in known.values()} == {None, 2}
     more = known["pick-2-more"].answer[0]
     np.testing.assert_array_equal(controls.answer_of(space, known["rest"], None, {2: more}), [UNSAID, UNSAID, 1.0])
     np.testing.assert_array_equal(controls.answer_of(space, known["rest"], None, {}), [UNSAID, UNSAID, 0.0])
     reading = Reading(lambda obs: obs, (), space, 0.1, 20)
-    rows = np.zeros((8, 3), np.float32)
-    asked = reading.questions(rows, 8, jax.random.key(0))[1]
+    asked = reading.questions(np.zeros((8, 3), np.float32), 8, jax.random.key(0))[1]
     assert (asked[:, :2] == 0).all()
     assert (asked[:, 2] != 0).all()
     with pytest.raises(UserError, match="cues name jaw, but the entries of an action are pan, lift, grip"):

@@ -102,8 +102,7 @@ def test_not_knowing_counts_for_nothing_and_an_answer_can_be_taken_back(opened, 
     assert file.labels.answer[2, 0] == 1.0
     assert file.labels.answer[1, 0] != expert(again)[0]
     assert file.counts == {"answer": 4, "unsure": 1, "undone": 2}
-    first = opened("first")
-    assert not first.undo(0)
+    assert not opened("first").undo(0)
     assert lines(tmp_path / "first") == 0
 
 
@@ -132,8 +131,7 @@ def test_a_session_opened_again_goes_on_where_it_stopped(opened, tmp_path):
 
 
 def test_a_line_that_a_kill_tore_is_asked_again(opened, tmp_path):
-    session = opened()
-    give(session, 6)
+    give(opened(), 6)
     whole = (tmp_path / "labels" / JSONL).read_bytes()
     folder = tmp_path / "cut"
     folder.mkdir()

@@ -168,8 +168,7 @@ def test_places_turn_about_their_origin_and_differences_follow():
 
 def test_beams_between_two_are_interpolated_and_nothing_is_seen_beyond_the_last():
     (lidar,) = [one for one in declared_distortions(Navigation(worlds=None)) if one.name == "lidar: turn"]  # pyright: ignore
-    obs = jnp.zeros(280).at[:271].set(jnp.arange(271.0))
-    before = undo_observation((lidar,), jnp.array([1.5]), obs)
+    before = undo_observation((lidar,), jnp.array([1.5]), jnp.zeros(280).at[:271].set(jnp.arange(271.0)))
     np.testing.assert_allclose(before[:4], [0.0, 0.0, 0.5, 1.5])  # turned by 1.5 beams: beam 2 is at 0.5
     assert before[270] == 268.5
 

@@ -38,8 +38,7 @@ def sickened(start):
         for block in start(group):
             wrong = jnp.where(jnp.asarray(group.seeds) == 5, 1e30, 1.0)
             scaled = lambda leaf, wrong=wrong: leaf * wrong.reshape(3, *[1] * (leaf.ndim - 1))  # noqa: E731
-            params = jax.tree.map(scaled, block.agent.params)
-            blocks.append(block.replace(agent=block.agent.replace(params=params)))
+            blocks.append(block.replace(agent=block.agent.replace(params=jax.tree.map(scaled, block.agent.params))))
         return blocks
 
     return made
@@ -127,5 +126,4 @@ def test_diverging_from_the_command_line_and_from_python(tmp_path):
         found = cl.train(
             cl.World(TASK, probes.WindowConfig()), None, wild, guidance=("none",), seeds=(3, 5, 8), progress=False
         ).results
-    last = found.slice(found.num_rows - 3).to_pylist()
-    assert [(row["failed"], row["reward"]) for row in last] == [(1.0, None)] * 3
+    assert [(row["failed"], row["reward"]) for row in found.slice(found.num_rows - 3).to_pylist()] == [(1.0, None)] * 3

@@ -44,7 +44,6 @@ def test_a_program_is_made_for_the_lanes_that_a_device_takes_at_once(monkeypatch
 def test_blocks_of_another_cut_are_cut_anew(monkeypatch):
     monkeypatch.setattr(lanes, "CORES", 1)
     before, after = group_of(5, lanes_per_block=2), group_of(5)
-    blocks = before.start()
-    (joined,) = after.recut(blocks)
+    (joined,) = after.recut(before.start())
     chex.assert_trees_all_equal(joined, *after.start())
     chex.assert_trees_all_equal(after.recut([joined]), [joined])

@@ -224,8 +224,7 @@ def test_labels_of_a_file_are_used_exactly(tmp_path):
     def refuse(config, env):
         raise AssertionError("a teacher was made although the labels are given")
 
-    task = dataclasses.replace(TASK, teacher=refuse)
-    train.run(Order(task, CONFIG, grid, out, labels_from=path))
+    train.run(Order(dataclasses.replace(TASK, teacher=refuse), CONFIG, grid, out, labels_from=path))
     state, _ = newest(out, "relative", grid)
     labels = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(block.guide.labels for block in state["rest"]))
     for lane, (seed, budget) in enumerate([(1, 35), (0, 35), (1, 60), (0, 60)]):

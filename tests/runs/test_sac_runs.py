@@ -47,8 +47,7 @@ def rows(out):
 
 
 def policy_of(folder, seed=1):
-    source = PolicySource.of_folder(folder, lambda name: TASK)
-    return LaneChoice(seed=(seed,)).lane_in(source, WalkConfig())[0]
+    return LaneChoice(seed=(seed,)).lane_in(PolicySource.of_folder(folder, lambda name: TASK), WalkConfig())[0]
 
 
 @pytest.fixture(scope="module")
