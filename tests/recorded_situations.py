@@ -42,8 +42,7 @@ def write(folder, rows=12, form="parquet", pictures=True):
         more = {"picture": np.array(names)} if pictures else {}
         np.savez(folder / "situations.npz", observation=observations, action=actions, **more)
     elif form == "csv":
-        head = ["observation", *columns, *(["picture"] if pictures else [])]
-        lines = [",".join(head)]
+        lines = [",".join(["observation", *columns, *(["picture"] if pictures else [])])]
         for row in range(rows):
             own = [" ".join(f"{value:.9g}" for value in observations[row])]
             own += [f"{value:.9g}" for value in actions[row]] + ([names[row]] if pictures else [])

@@ -71,8 +71,7 @@ def test_a_member_that_is_none_is_not_offered():
 
 
 def test_every_symmetry_is_drawn_and_maps_a_row_as_a_whole():
-    rng = np.random.default_rng(0)
-    obs, action, other = jnp.array(rng.normal(size=(3, ROWS, 2)), jnp.float32)
+    obs, action, other = jnp.array(np.random.default_rng(0).normal(size=(3, ROWS, 2)), jnp.float32)
     image = random_symmetries(jax.random.key(0), probes.Window(mirrors=True), ROWS)
     seen, moved = image(obs, action)
     quarters = np.round(np.asarray(difference(obs, seen)) / (math.pi / 2)).astype(int) % 4

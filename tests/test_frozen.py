@@ -171,11 +171,9 @@ def test_python_adapts_and_measures_as_the_commands_do(tmp_path):
 @pytest.mark.parametrize("kind", ["relative", pytest.param("reading", marks=pytest.mark.long)])
 def test_python_corrects_by_a_label_file_as_the_command_does(tmp_path, kind):
     file = frozen_worlds.recorded_labels(tmp_path)
-    command = ["adapt", "frozen_worlds:straight", "--labels-from", file, "--guidance", kind]
-    run(*command, "--out", tmp_path / "command")
+    run("adapt", "frozen_worlds:straight", "--labels-from", file, "--guidance", kind, "--out", tmp_path / "command")
     better = cl.correct(straight, file, guidance=kind)
-    typed = cl.load_policy(tmp_path / "command", base=straight)
-    np.testing.assert_array_equal(typed(SEEN), better(SEEN))
+    np.testing.assert_array_equal(cl.load_policy(tmp_path / "command", base=straight)(SEEN), better(SEEN))
     with pytest.raises(UserError, match="corrects frozen_worlds:straight, but the base given acts otherwise"):
         cl.load_policy(tmp_path / "command", base=lambda obs: obs[:, ::-1])
     # Adam amplifies the rounding of what the evidence does not decide: by 4% between processors

@@ -70,8 +70,7 @@ def test_a_clip_is_a_film_of_pictures_in_order():
 
 
 def test_a_still_shows_six_frames_first_and_last_among_them(tmp_path):
-    frames = [plain((10 * number, 0, 0)) for number in range(21)]
-    pictures.still(frames, tmp_path / "still.png")
+    pictures.still([plain((10 * number, 0, 0)) for number in range(21)], tmp_path / "still.png")
     sheet = np.asarray(Image.open(tmp_path / "still.png"))
     assert sheet.shape == (24, 60, 3)
     assert [sheet[row, column, 0] for row in (5, 17) for column in (5, 25, 45)] == [0, 40, 80, 120, 160, 200]

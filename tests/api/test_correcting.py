@@ -124,8 +124,7 @@ def test_it_can_be_corrected_again(better, tmp_path):
     again = cl.correct(better, asked(60, seed=3), **how)
     again.save(tmp_path / "again")
     assert better.trained.scalars.eps_deg == pytest.approx(1 / 36)  # what a second correction begins with
-    named = json.loads((tmp_path / "again" / "policy.json").read_text())["of"]
-    assert named == {"code": f"{off.__module__}:off"}
+    assert json.loads((tmp_path / "again" / "policy.json").read_text())["of"] == {"code": f"{off.__module__}:off"}
     np.testing.assert_allclose(cl.load_policy(tmp_path / "again", base=off)(OTHERS), again(OTHERS), atol=1e-6)
     with pytest.raises(cl.UserError, match="corrected with other bounds or cues before"):
         cl.correct(better, asked(60), low=LOW, high=(1.0, 1.0, 1.0), **how)

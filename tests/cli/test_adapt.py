@@ -134,11 +134,9 @@ def test_lanes_of_a_run_are_adapted_one_each_and_again(home, tmp_path):
     assert row["seeds"] == base["seeds"] == alone["seeds"][::-1] == [1, 0]
     assert base["reward"] == alone["reward"][::-1]
     assert np.mean(row["reward"]) > np.mean(base["reward"])
-    agent = cl.load_policy(run, seed=0)
-    np.testing.assert_array_equal(cl.load_policy(out, policy="base", seed=0)(SEEN), agent(SEEN))
+    np.testing.assert_array_equal(cl.load_policy(out, policy="base", seed=0)(SEEN), cl.load_policy(run, seed=0)(SEEN))
     assert main([*["adapt", str(out), *FIT, "--labels", "10"], "--base.seed", "0", "--out", str(chain)]) == 0
-    moved = cl.load_policy(chain, policy="base")(SEEN)
-    np.testing.assert_array_equal(moved, cl.load_policy(out, seed=0)(SEEN))
+    np.testing.assert_array_equal(cl.load_policy(chain, policy="base")(SEEN), cl.load_policy(out, seed=0)(SEEN))
 
 
 def test_the_traceback_of_a_policy_that_fails_stands_below_the_line(tmp_path, capsys):

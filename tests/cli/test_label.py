@@ -171,8 +171,7 @@ def test_the_next_command_has_the_options_that_labels_depend_on(monkeypatch, tmp
 
 
 def test_a_run_of_another_task_is_no_policy_here(run_folder, refused, tmp_path):
-    command = ["label", OWN, run_folder, "--out", tmp_path / "labels"]
-    refused(command, "is a run of bandit, not of wandering", tmp_path)
+    refused(["label", OWN, run_folder, "--out", tmp_path / "labels"], "is a run of bandit, not of wandering", tmp_path)
 
 
 def test_labels_are_inspected(labelled, capsys):
@@ -187,8 +186,7 @@ def test_labels_are_inspected(labelled, capsys):
 def test_labels_are_merged(labelled, tmp_path, refused, capsys):
     both = tmp_path / "both.parquet"
     assert main(["labels", "merge", str(labelled / "one"), str(labelled / "two"), "--out", str(both)]) == 0
-    file = label_files.read(both)
-    assert file.people.who.tolist() == ["one"] * 12 + ["two"] * 12
+    assert label_files.read(both).people.who.tolist() == ["one"] * 12 + ["two"] * 12
     assert main(["labels", "inspect", str(both)]) == 0
     assert "not known" not in capsys.readouterr().out  # what does not stand is left out
     refused(["labels", "merge", labelled / "one", "--out", both], "both.parquet exists: give another --out", tmp_path)

@@ -59,8 +59,7 @@ def test_a_policy_of_code_is_corrected_judged_and_exported(capsys):
 
     obs = recorded.arrays()[0]
     better = cl.load_policy("policies/arm", base=own_arm.policy)
-    found = cl.load_exported("exported")(obs, own_arm.policy(obs))
-    np.testing.assert_allclose(found, better(obs), atol=1e-5)
+    np.testing.assert_allclose(cl.load_exported("exported")(obs, own_arm.policy(obs)), better(obs), atol=1e-5)
     assert main(["export", "policies/arm", "--format", "numpy", "--base", "own_arm:policy", "--out", "no"]) == 2
     assert "or export the correction alone (--only-correction" in capsys.readouterr().err
 

@@ -13,6 +13,5 @@ def test_an_evaluation_of_the_short_episodes_alone_is_refused(refused, tmp_path)
     refused(["evaluate", "billiards", "--episodes", "3"], "billiards counts steps, not episodes", tmp_path)
     few = ["--schedule.eval-envs", "10", "--schedule.eval-steps", "200"]
     sweep = ["sweep", "navigation", "--preset", "quickstart", *few, "--out", tmp_path / "none"]
-    cut = "an episode lasts up to 21: give --schedule.eval-steps 210"
-    refused([*sweep, *WORLDS, "21"], cut, tmp_path)
+    refused([*sweep, *WORLDS, "21"], "an episode lasts up to 21: give --schedule.eval-steps 210", tmp_path)
     refused([*sweep, "--task.worlds", "0"], "task.worlds is 0: give a number from 1", tmp_path)

@@ -68,8 +68,7 @@ def test_a_setting_is_a_run_and_the_grid_is_reported_by_settings(grid, refused, 
     assert main(["evaluate", str(folder / FIVE), "--steps", "100", "--envs", "20"]) == 0
     capsys.readouterr()
     assert main(["report", str(folder), "--json"]) == 0
-    table = json.loads(capsys.readouterr().out)["rows"]
-    assert [(row["run"], row["seeds"]) for row in table] == [(TWO, 1), (FIVE, 1)]
+    assert [(row["run"], row["seeds"]) for row in json.loads(capsys.readouterr().out)["rows"]] == [(TWO, 1), (FIVE, 1)]
 
 
 def test_impossible_grids_are_refused_before_anything_is_trained(grid, refused, tmp_path):

@@ -144,8 +144,7 @@ def test_a_compiled_decision_that_calls_back_into_python_is_refused(folder, tmp_
     there = copied(folder / "stablehlo", tmp_path)
     exported = jax.export.deserialize(bytearray((there / "decision.stablehlo").read_bytes()))
     called = exported.mlir_module_serialized + b"xla_ffi_python_cpu_callback"  # as names of what is called stand there
-    changed = dataclasses.replace(exported, mlir_module_serialized=called)
-    (there / "decision.stablehlo").write_bytes(changed.serialize())
+    (there / "decision.stablehlo").write_bytes(dataclasses.replace(exported, mlir_module_serialized=called).serialize())
     edit_contract(there)
     with pytest.raises(UserError, match="calls Python functions"):
         contract.open_decision(there)

@@ -65,8 +65,7 @@ def policy(env) -> ReadingPolicy:
         mean=jnp.full(5, 2.0), deviation=jnp.full(5, 3.0), varies=jnp.ones(5).at[1].set(0.0)
     )
     own = {"known": random(1, 6, 7), "alpha": random(2, 6, 2), "length": jnp.full(7, 1.5), "scale": jnp.float32(0.1)}
-    correction = read.correction.replace(change=change, frame=frame, **own)
-    return read.replace(correction=correction, bound=jnp.float32(0.2))
+    return read.replace(correction=read.correction.replace(change=change, frame=frame, **own), bound=jnp.float32(0.2))
 
 
 def test_a_checkpoint_gets_the_steps_the_arrays_and_the_golden_cases(env, policy, tmp_path):

@@ -103,8 +103,7 @@ def test_a_suite_draws_one_control_for_all_faulty_teachers_and_names_failed_lane
 
 def test_the_command_takes_a_level_for_the_score_1(tasks, capsys):
     assert main(["report", str(tasks), "--level", "60", "--json"]) == 0
-    tables = json.loads(capsys.readouterr().out)
-    assert tables["ends"] == {"large": [10.0, 60.0], "small": [pytest.approx(0.1), 60.0]}
+    assert json.loads(capsys.readouterr().out)["ends"] == {"large": [10.0, 60.0], "small": [pytest.approx(0.1), 60.0]}
     assert main(["report", str(tasks), "--level", "5", "--json"]) == 2
     assert "5 in large is no better than its unguided agents, 10: give a better --level" in capsys.readouterr().err
     assert main(["report", str(tasks), "--efficiency", "--json"]) == 2

@@ -156,6 +156,5 @@ def test_the_command_writes_tables_and_a_section(runs, tmp_path):
     shown, *_ = (row for row in section.splitlines() if row.startswith("| frame | relative | 500 | "))
     assert f"| {float(own['steps_ratio']):.2f} [" in shown
     assert {row["reference"] for row in rows(out / "equal_area.csv")} == {"relative"}
-    summary = rows(out / "summary.csv")
-    assert [float(row["mean"]) for row in summary] == [float(row["mean"]) for row in table.values()]
+    assert [float(row["mean"]) for row in rows(out / "summary.csv")] == [float(row["mean"]) for row in table.values()]
     assert "differ in more than" not in text  # each run has one configuration

@@ -17,8 +17,7 @@ HARD = RANDOM.normal(size=EPISODES)  # what all policies find hard or easy, epis
 def measured(seeds, gain=0.0, labels=0, **other):
     """Rows of policies that share their episodes' luck and differ by `gain` and a little."""
     each = HARD + gain + 0.1 * np.random.default_rng(seeds).normal(size=(len(seeds), EPISODES))
-    metrics = {"reward": each.mean(-1)}
-    return Measured("relative", labels, 100, np.array(seeds), metrics, {"reward": each}, **other)
+    return Measured("relative", labels, 100, np.array(seeds), {"reward": each.mean(-1)}, {"reward": each}, **other)
 
 
 def test_an_interval_of_a_mean_covers_it_in_95_of_100():

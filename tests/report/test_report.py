@@ -119,8 +119,7 @@ def test_says_what_is_missing(runs, tmp_path):
     planned(runs / "tuned", split="tuning", grid={"guidance": ["none"]})
     write(runs / "sweep" / "demonstration", "demonstration", 0.2, 100, steps=STEPS[:9])
     (runs / "sweep" / "demonstration" / "config.json").unlink()
-    grid = {"guidance": ["none", "demonstration"]}
-    planned(runs / "sweep", total_steps=100, grid=grid)
+    planned(runs / "sweep", total_steps=100, grid={"guidance": ["none", "demonstration"]})
     text = report([runs], tmp_path / "report").read_text()
     missing = text.split("## Missing")[1].split("## Where")[0]
     assert "scalar-a: at step 50 of 100 (50%)" in missing
@@ -143,8 +142,7 @@ def test_seeds_budgets_and_pieces_of_the_plan_without_results_are_named(runs, tm
     grid = {"guidance": ["none", "relative"], "seeds": list(range(10)), "labels": [100, 700]}
     planned(runs, total_steps=100, grid=grid)
     for name, index in (("unguided", 3), ("relative-100", 5)):
-        shard = {"index": index, "count": 1000, "seeds": list(range(1000))}
-        planned(runs / name, total_steps=100, shard=shard)
+        planned(runs / name, total_steps=100, shard={"index": index, "count": 1000, "seeds": list(range(1000))})
     missing = report([runs], tmp_path / "report").read_text().split("## Missing")[1].split("## Where")[0]
     for kind in grid["guidance"]:
         assert f"no results of {kind} guidance with the seeds 8, 9" in missing

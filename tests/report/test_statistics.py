@@ -26,8 +26,7 @@ def test_intervals_of_normal_data_cover_the_truth_as_often_as_the_docstring_says
     rng = np.random.default_rng(0)
     for seeds, expected in ((5, 0.90), (20, 0.945)):
         found = statistics.interval(rng.normal(size=(seeds, 1500)), resamples=1000)
-        covered = np.mean((found.lower <= 0) & (found.upper >= 0))
-        assert covered == pytest.approx(expected, abs=0.03)
+        assert np.mean((found.lower <= 0) & (found.upper >= 0)) == pytest.approx(expected, abs=0.03)
 
 
 def test_equal_seeds_have_no_width_and_a_single_seed_no_interval():

@@ -72,8 +72,7 @@ def test_a_description_stays_with_a_table_through_every_change(tmp_path):
 
 @pytest.mark.parametrize("torn", [b'{"fish": "ca', b"\x00\x00", b'{"fish": "\xc3'])
 def test_a_torn_last_line_is_dropped_by_whoever_continues(tmp_path, torn):
-    path = written(tmp_path, "pike", "eel")
-    with path.open("ab") as file:
+    with written(tmp_path, "pike", "eel").open("ab") as file:
         file.write(torn)
     assert read(tmp_path)["fish"].to_pylist() == ["pike", "eel"]
     written(tmp_path, "carp")

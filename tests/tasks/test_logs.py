@@ -103,8 +103,7 @@ def test_bounds_are_those_of_the_recording_and_that_is_told(folder):
 
 
 def test_a_configuration_is_plain_and_describes_the_layout_without_the_folder(folder):
-    task = logs.task_of(folder, CUES, **BOUNDS)
-    config = task.plain()
+    config = logs.task_of(folder, CUES, **BOUNDS).plain()
     assert configuration.from_json(logs.LogsConfig, configuration.to_json(config)) == config
     for file in folder.rglob("*.*"):
         file.unlink()

@@ -106,8 +106,7 @@ def test_the_probes_keep_the_laws(env):
 
 def guide(**changes):
     """The paper's kind with other methods, each made from the one that is there: (method) -> method."""
-    methods = {name: change(getattr(Relative, name)) for name, change in changes.items()}
-    return type("Altered", (Relative,), methods)
+    return type("Altered", (Relative,), {name: change(getattr(Relative, name)) for name, change in changes.items()})
 
 
 def result(change):
