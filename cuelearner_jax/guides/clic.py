@@ -166,9 +166,8 @@ class Clic(Guide):
         """Return labels (slots, ...) as contrasts; a label that names no cue is not valid."""
         numbers, valid = jnp.arange(len(labels.valid)), says_something(labels.answer) | self.form.is_action
         base, valid = labels.action if labels.base is None else labels.base, labels.valid & valid
-        never = jnp.broadcast_to(
-            silent_cues(labels.answer, valid, self.holds_out) & self.form.by_eps, labels.answer.shape
-        )
+        never = silent_cues(labels.answer, valid, self.holds_out) & self.form.by_eps
+        never = jnp.broadcast_to(never, labels.answer.shape)
         return Contrast(labels.obs, labels.action, labels.answer, valid, numbers, base, never)
 
     def augmented(self, key: PRNGKeyArray, batch: Contrast) -> Contrast:
