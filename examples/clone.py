@@ -36,9 +36,11 @@ def named(
 ) -> tuple[Float[Array, "1"], Bool[Array, ""]]:
     """The number of the point nearest to the best action of a teacher, and whether it answered.
 
-    Of the faults in `scalars` it has those that mean something here: its bias and its silence.
+    It has the faults in `scalars` that mean something here: a bias, mistakes, which are the opposite, and silence.
     """
     best = rotate(teacher.best_action(state, obs), jnp.deg2rad(scalars.teacher_bias_deg))
+    mistaken = jax.random.bernoulli(jax.random.fold_in(key, 1), scalars.mistake_probability)
+    best = jnp.where(mistaken, -best, best)
     return jnp.argmax(evenly_spaced(POINTS) @ best)[None] * 1.0, ~jax.random.bernoulli(key, scalars.silence_probability)
 
 

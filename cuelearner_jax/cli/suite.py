@@ -20,20 +20,22 @@ from typing import Any
 import jax
 
 from cuelearner_jax import devices, signals
+from cuelearner_jax.adaptation import by_model
 from cuelearner_jax.cli.options import check_numbers, look_ahead, out, parse
 from cuelearner_jax.cli.sources import preset_of, source_of
-from cuelearner_jax.config import plain
+from cuelearner_jax.config import check_part, plain
 from cuelearner_jax.errors import NotFinite, UserError, suggestion
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.report import suite as page
 from cuelearner_jax.storage import table as tables
 from cuelearner_jax.storage.whole import hold, replacing
 from cuelearner_jax.studies import suite
-from cuelearner_jax.studies.suite import ADAPT, RIGHT, TABLE, Cell, World
+from cuelearner_jax.studies.suite import ADAPT, TABLE, Cell, World
 from cuelearner_jax.task import QUICKSTART
 from cuelearner_jax.tasks.presets import GROUPS, with_groups
 
 STOPPED = "stopped, with all work saved; the same command goes on"
+KEYS = ("use", "subject", "preset", "scenario", "metric", "ends", "bound")  # of a world, beside groups of options
 WORKS_FOR = "CUELEARNER_SUITE_WORKS_FOR"  # environment variable of a process of the suite: the process it works for
 
 
@@ -67,17 +69,23 @@ def run(arguments: list[str]) -> None:
     scale = table["scales"][options.scale]
     kinds = [guidances.resolve(kind).name for kind in (*scale.get("kinds", table["kinds"]), *options.guidance)]
     try:
-        worlds = [_world(name, table["worlds"][name] | own) for name, own in scale["worlds"].items()]
+        worlds = [_world(name, _joined(table["worlds"][name], own)) for name, own in scale["worlds"].items()]
         cells = suite.cells_of(table, scale, worlds, list(dict.fromkeys(kinds)))
+        for cell in cells:
+            check_part(cell.config().scalars, f"teachers.{cell.teacher}")
+            replace(by_model.SIZES, **cell.world.sizes)
     except KeyError as error:
         raise UserError(f"--table {options.table} has no {error}, which {options.scale} needs") from error
+    except TypeError as error:
+        raise UserError(f"--table {options.table} names a field that does not exist: {error}") from error
     obstacles = [cell.obstacle() for cell in cells]
     sensible = [cell for cell, obstacle in zip(cells, obstacles, strict=True) if obstacle is None]
     _claim(options.out, f"# {options.scale}\n{options.table.read_text(encoding='utf-8')}")
     left = {(cell.world.name, cell.kind) for cell in sensible if not suite.is_done(options.out, cell)}
     count = min(len(left), options.processes or (devices.CORES if jax.default_backend() == "cpu" else 1))
+    failure = None
     if count > 1:
-        _run_in_processes(count, arguments, options.out, scale.get("is_short", False))
+        failure = _run_in_processes(count, arguments, options.out, scale.get("is_short", False))
     else:
         _run_cells(sensible, options)
     if WORKS_FOR in os.environ:
@@ -95,7 +103,9 @@ def run(arguments: list[str]) -> None:
             *(f"- left out: {line}" for line in dict.fromkeys(filter(None, obstacles))),
         ]
         command = shlex.join(["cuelearner", "suite", *arguments])
-        out.print(f"wrote {page.write(options.out, rows, RIGHT, lines, command)}")
+        out.print(f"wrote {page.write(options.out, rows, scale['teachers'][0], lines, command)}")
+    if failure:
+        raise UserError(failure)
 
 
 def _run_cells(cells: list[Cell], options: Suite) -> None:
@@ -127,11 +137,11 @@ def _run_cells(cells: list[Cell], options: Suite) -> None:
                     raise
 
 
-def _run_in_processes(count: int, arguments: list[str], folder: Path, is_short: bool) -> None:
+def _run_in_processes(count: int, arguments: list[str], folder: Path, is_short: bool) -> str | None:
     """Run the command in processes that take its cells; each writes a log into the folder.
 
-    Those of a short scale compile in half the time, and their programs run slower. Raises Interrupted after a signal,
-    and UserError if a process failed.
+    Those of a short scale compile in half the time, and their programs run slower. Returns a message if a process
+    failed. Raises Interrupted after a signal.
     """
     flags = ["--xla_backend_optimization_level=0"] * is_short
     if is_short and jax.__version_info__ < (0, 11):  # JAX does not start with a flag that it no longer knows
@@ -153,7 +163,8 @@ def _run_in_processes(count: int, arguments: list[str], folder: Path, is_short: 
             raise signals.Interrupted(STOPPED)
     for log, status in zip(logs, statuses, strict=True):
         if status:
-            raise UserError(f"a process ended with status {status}: see the end of {log}; the same command goes on")
+            return f"a process ended with status {status}: see the end of {log}, and then give the same command"
+    return None
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -166,9 +177,18 @@ def _read(path: Path) -> dict[str, Any]:
     return table
 
 
+def _joined(world: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Return a world with a scale's own keys; of a group of options a scale names those that differ."""
+    return world | {key: world.get(key, {}) | value if isinstance(value, dict) else value for key, value in own.items()}
+
+
 def _world(name: str, values: dict[str, Any]) -> World:
     """Return a world of the table. Raises UserError for a task, preset or scenario that does not exist."""
-    values, groups = dict(values), {group: values[group] for group in GROUPS if group in values}
+    if unknown := sorted(values.keys() - {*KEYS, *GROUPS}):
+        raise UserError(f"world {name} of the table has {unknown[0]!r}{suggestion(unknown[0], [*KEYS, *GROUPS])}")
+    if values["use"] not in suite.USES:
+        raise UserError(f"world {name} of the table has use {values['use']!r}: give {' or '.join(suite.USES)}")
+    groups = {group: values[group] for group in GROUPS if group in values}
     source, start = source_of(look_ahead(shlex.split(values["subject"]))), values.get("scenario")
     config = source.config
     if values["use"] == ADAPT:

@@ -95,7 +95,7 @@ def _add(overs: dict[str, Aggregates], missing: list[str], name: str, each: list
         overs[name] = aggregates_of(each, 1.0, lower_is_better=False)
         missing += [f"{name}: {line}" for line in overs[name].missing]
     except UserError as error:
-        missing.append(f"{name}: no aggregates: {error}")
+        missing.append(f"{name}: no aggregates: {str(error).partition(': give')[0]}")
 
 
 def _table(overs: dict[str, Aggregates], table: pa.Table) -> list[str]:

@@ -37,7 +37,6 @@ from cuelearner_jax.task import shape_of
 TABLE = Path(__file__).with_suffix(".toml")
 USES = BOOTSTRAP, ADAPT = "bootstrap", "adapt"
 ACTS = NoGuide, HeuristicGuide  # kinds without labels that act in place of a finished policy, or as it does
-RIGHT = "right"  # the teacher without faults
 
 
 class World(NamedTuple):
@@ -126,7 +125,12 @@ class Cell(NamedTuple):
             columns |= {f"{name}_each": group_means(each) for name, each in one.each.items()}
             episodes = next(iter(one.each.values())).shape[-1]
             rows += [{name: column[lane].tolist() for name, column in columns.items()} for lane in range(self.seeds)]
-        described = {"cell": self.name, "task": configuration.to_json(config.task), "scalars": vars(config.scalars)}
+        described = {"world": self.world.name, "teacher": self.teacher, "bound": self.world.bound}
+        described |= {
+            "sizes": dict(self.world.sizes),
+            "task": configuration.to_json(config.task),
+            "scalars": vars(config.scalars),
+        }
         constants = {"run": self.world.name, "task": source.task.name, "guidance": self.kind, "split": "validation"}
         constants |= {"config_hash": configuration.digest(described), **provenance()}
         rows = [{"episodes": episodes, **constants, **tables.plain(row)} for row in rows]
@@ -168,16 +172,18 @@ def collect(out: Path, worlds: list[World]) -> pa.Table:
     parts = []
     for world in worlds:
         for file in sorted((out / world.use / world.name).rglob(results.PARQUET)):
-            rows = results.read(file).drop_columns(["folder"])
+            rows = results.read(file)
             columns = {"task": world.name, "preset": world.start, "use": world.use, "metric": world.metric}
             columns["teacher"] = file.relative_to(out / world.use / world.name).parts[0]
+            columns["folder"] = str(file.parent.relative_to(out))
             for name, value in columns.items():
                 rows = rows.drop_columns([name] if name in rows.column_names else [])
                 rows = rows.append_column(name, pa.repeat(pa.scalar(value), rows.num_rows))
             if world.use == BOOTSTRAP:
                 rows = rows.append_column("rewarded_steps", pc.cast(rows["step"], pa.float64()))
-            for end in ("", "_each"):
-                rows = rows.append_column(f"score{end}", _scores(rows[world.metric + end].combine_chunks(), world.ends))
+            for name, metric in (("score", world.metric), ("score_each", f"{world.metric}_each")):
+                scores = _scores(rows[metric].combine_chunks(), world.ends)
+                rows = rows.drop_columns([name] if name in rows.column_names else []).append_column(name, scores)
             parts.append(rows)
     return pa.concat_tables(parts, promote_options="permissive")
 

@@ -85,4 +85,11 @@ def task_of(name: str) -> Task:
     space = DIRECTIONS if config.cues == 1 else Box((-1.0,) * config.cues, (1.0,) * config.cues)
     run = RunConfig(config, Sizes(), plain_scalars(space))
     preset = Preset("labels about a policy's actions", run, ("relative",), (100,))
-    return dataclasses.replace(ZOO, default=config, presets={"paper": preset})
+
+    def environment(world: ZooConfig, split: str) -> ZooEnvironment:
+        if world.cues != config.cues:  # the preset's strength of answers is that of its own space
+            raise UserError(f"task.cues is {world.cues}: name zoo:{world.cues} in place of zoo:{name}")
+        return ROBOT.environment(world, split)
+
+    bodies = (dataclasses.replace(ROBOT, environment=environment),)
+    return dataclasses.replace(ZOO, default=config, bodies=bodies, presets={"paper": preset})

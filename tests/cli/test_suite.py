@@ -94,6 +94,28 @@ def test_a_suite_is_one_table_and_one_page_and_goes_on(tmp_path, capsys, monkeyp
     assert "holds a suite of another scale or table" in capsys.readouterr().err
 
 
+def test_a_scale_names_the_options_of_a_group_that_differ():
+    world, own = {"bound": 1.0, "task": {"a": 1, "b": 2}}, {"task": {"b": 3}, "sizes": {"c": 4}}
+    assert command._joined(world, own) == {"bound": 1.0, "task": {"a": 1, "b": 3}, "sizes": {"c": 4}}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("bound =", "bounds =", "world correct of the table has 'bounds', did you mean 'bound'?"),
+        ('"adapt"', '"adpat"', "world correct of the table has use 'adpat': give bootstrap or adapt"),
+        ("fit_steps", "steps_fit", "names a field that does not exist"),
+        ('says = "one"', "mistake_probability = 20", "teachers.one_cue.mistake_probability is 20"),
+        ('says = "one"', "mistakes = 0.2", "names a field that does not exist"),
+    ],
+)
+def test_a_mistake_in_a_table_is_told_before_a_cell_is_run(tmp_path, capsys, old, new, message):
+    (table := tmp_path / "wrong.toml").write_text(TINY.replace(old, new))
+    assert main(["suite", "--scale", "tiny", "--table", str(table), "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_process_ends_with_the_one_that_it_works_for(monkeypatch):
     with command._deadline(60.0) as is_over:
         for parent, ended in ((os.getppid(), False), (0, True)):

@@ -33,8 +33,8 @@ class ArmConfig:
     within: Annotated[float, Bounds(0, above=True)] = 0.05
     """An episode is a success if it ends within this distance of the goal [m]."""
     camera_turn_deg: Annotated[float, Bounds(-180, 180)] = 0.0
-    """Changed world: the camera is rotated counterclockwise about the robot's base by this angle [deg], so that goal
-    and cube seem rotated."""
+    """Changed world: the camera is rotated clockwise about the robot's base by this angle [deg], so that goal and cube
+    seem rotated counterclockwise."""
     camera_offset: Annotated[tuple[float, float, float], Bounds(-1, 1)] = (0.0, 0.0, 0.0)
     """Changed world: offset of the observed positions of goal and cube, x, y and z [m]."""
     friction: Annotated[float, Bounds(0.01, 10)] = 1.0

@@ -24,7 +24,7 @@ FRAMES = 90  # of a film
 LONGEST = 3.0  # a film [s]: longer shots are shown faster
 TRAIL = 91  # moments of a trail
 TRAIL_SECONDS = 3.0  # so much of a shot a trail tells at most [s]
-LEAST_MOVE = 1e-4  # what a ball moves by that was hit, at least [m]
+LEAST_MOVE = 1e-4  # by how much the way of a ball that is hit bends between two times, at least [m]
 
 
 def rail_width(table: Table) -> float:
@@ -132,7 +132,8 @@ def trails(env: Billiards, state: Balls, actions: Float[Array, "n 2"]) -> list[s
 
 
 def _trail(radius: float, positions: np.ndarray, pocketed: np.ndarray) -> str:
-    moves = np.linalg.norm(positions - positions[:1], axis=-1) > LEAST_MOVE
+    # A hit bends a ball's way at once, a tilted table hardly does.
+    moves = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=-1) > LEAST_MOVE
     moves[:, 0] = False
     hit = int(moves.any(axis=1).argmax())  # the first moment at which a target has moved
     numbers = [0, int(moves[hit].argmax())] if moves.any() else [0]

@@ -33,7 +33,7 @@ class NavigationConfig:
     max_steps: Annotated[int, EPISODE] = 200
     """Largest number of steps of 0.2 s in an episode, after which it is truncated."""
     goal_radius: Annotated[float, Bounds(0, above=True)] = 0.5
-    """The goal is reached within this distance [m]."""
+    """The goal is reached within this distance at the end of a step, which may be 0.2 m long [m]."""
     max_range: Annotated[float, Bounds(0, above=True)] = 10.0
     """Range of the lidar [m]."""
     lidar_rotation_deg: float = 0.0

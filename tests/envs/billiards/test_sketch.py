@@ -4,12 +4,13 @@ import math
 from xml.etree import ElementTree
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from billiards_scenes import balls
 
 from cuelearner_envs.billiards import Table
 from cuelearner_envs.billiards.environment import Billiards
-from cuelearner_envs.billiards.sketch import reel, sketch
+from cuelearner_envs.billiards.sketch import TRAIL, TRAIL_SECONDS, _trail, reel, sketch
 
 BOTH = (False, False)  # pocketed
 ENV = Billiards(Table.one_ball().replace(max_events=24))
@@ -47,3 +48,11 @@ def test_a_film_ends_as_the_shot_does():
     assert 0 < film.period * len(film.frames) <= 3.0
     turned = Billiards(ENV.table, action_turn=jnp.array(-math.pi / 4))  # a changed world's film is that world's
     assert reel(turned, state, along).words == "nothing pocketed"
+
+
+def test_a_trail_is_that_of_the_ball_that_is_hit_though_a_tilted_table_moves_another():
+    times = np.linspace(0, TRAIL_SECONDS, TRAIL)
+    along = np.stack([times, 0.01 * times**2, np.maximum(times - 1, 0)], 1)  # ball 1 by a tilt, ball 2 hit after 1 s
+    drawn = _trail(0.03, np.stack([along, along * 0 + [0, 0.5, -0.25]], -1), np.zeros((TRAIL, 3), bool))
+    (dashed,) = [line for line in drawn.split("<polyline")[1:] if "dasharray" in line]
+    assert ",0.25 " in dashed  # y points down in pictures

@@ -100,6 +100,8 @@ def test_a_world_is_found_by_its_name():
     assert not np.array_equal(env.world.robot.unit, other.world.robot.unit)
     with pytest.raises(UserError, match="unknown robots 'zoo:9': give zoo:1"):
         registry.resolve("zoo:9")
+    with pytest.raises(UserError, match=r"task\.cues is 1: name zoo:1 in place of zoo:2"):
+        task.environment(task.configure(cues=1))
     with pytest.raises(UserError, match=r"task\.error is 'gains'"):
         task.configure(error="gains")
 
