@@ -76,8 +76,7 @@ def run() -> None:
     if asked.out:
         how = {"subject": Path(asked.policy).name, "calls": asked.calls, "repeats": asked.repeats}
         kernels = {"openblas_coretype": os.environ.get("OPENBLAS_CORETYPE", "")}
-        contents = {**how, **kernels, **provenance(), "rows": rows}
-        asked.out.write_text(json.dumps(contents, indent=1) + "\n")
+        asked.out.write_text(json.dumps({**how, **kernels, **provenance(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -205,8 +205,7 @@ def _turn(degrees: float) -> np.ndarray:
 @cache
 def world_of(robot: str, change: str) -> cl.World:
     """Return a changed world. Nothing of it is declared, not even names, unless the change says so."""
-    tells = robot_of(robot).changes[change].declared
-    layout = fetch_layout.layout_of(f"{robot}-v4") if tells else None
+    layout = fetch_layout.layout_of(f"{robot}-v4") if robot_of(robot).changes[change].declared else None
     return cl.from_gymnasium(Changed, robot=robot, change=change, processes=1, observation=layout)
 
 

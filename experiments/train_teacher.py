@@ -133,8 +133,7 @@ def _learn(env: Any, config: TeacherConfig, out: Path, seed: int) -> tuple[Learn
             if stopping.is_set():
                 raise Interrupted(f"stopped at round {int(state.round)}; go on with the same command and --resume")
     # It aims perfectly and has no habit.
-    teacher = LearnedTeacher(env, state.average, 0.0, 0.0, config.layers, config.directions)
-    return teacher, history.tolist()
+    return LearnedTeacher(env, state.average, 0.0, 0.0, config.layers, config.directions), history.tolist()
 
 
 def main(arguments: list[str] | None = None) -> int:

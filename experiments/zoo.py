@@ -348,8 +348,7 @@ def measured(file: Path, cells: list[Cell], at_once: int, measure: Any) -> list[
         rows += measure(padded)[: len(part)]
         print(f"{file.stem}: {len(rows)} of {len(cells)} cells", flush=True)
         about = {f"cuelearner.{name}": str(value) for name, value in provenance().items()}
-        whole = pa.Table.from_pylist(rows).replace_schema_metadata(about)
-        pq.write_table(whole, file, compression="zstd")
+        pq.write_table(pa.Table.from_pylist(rows).replace_schema_metadata(about), file, compression="zstd")
     return rows
 
 

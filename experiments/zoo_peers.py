@@ -132,8 +132,7 @@ def measure(
     worlds, keys = study.worlds_of(robots, cells)
     space, (strength, most, rate) = study.space_of(robots), setting
     env = Even.of(zoo.unchanged(jax.tree.map(lambda leaf: leaf[0], robots)), jax.random.key(0))
-    of = KINDS[kind]
-    guidance = of(SIZES, spaces_of(env))
+    guidance = KINDS[kind](SIZES, spaces_of(env))
     unit = 90.0 if len(space.cues) == 1 else 0.5  # half of a cue's range: degrees of directions, else shares
     eps = strength * unit
     scalars = replace(

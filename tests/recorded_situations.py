@@ -24,8 +24,7 @@ LOW, HIGH = (-0.5, 0.0, -1.0), (0.5, 0.4, 1.0)
 def arrays(rows=12, seed=0):
     """Observations (rows, 4) and actions (rows, 3) of a box."""
     random = np.random.default_rng(seed)
-    observations = random.uniform(-1, 1, (rows, 4)).astype(np.float32)
-    return observations, random.uniform(LOW, HIGH, (rows, 3)).astype(np.float32)
+    return random.uniform(-1, 1, (rows, 4)).astype(np.float32), random.uniform(LOW, HIGH, (rows, 3)).astype(np.float32)
 
 
 def write(folder, rows=12, form="parquet", pictures=True):

@@ -48,8 +48,7 @@ def used(rows):
 def to_box(points, box):
     """Distance from points (..., 2) to a box; 0 inside."""
     cos, sin = math.cos(box[2]), math.sin(box[2])
-    offset = points - box[:2]
-    own = np.abs(offset @ np.array([[cos, -sin], [sin, cos]]))
+    own = np.abs((points - box[:2]) @ np.array([[cos, -sin], [sin, cos]]))
     return np.linalg.norm(np.maximum(own - box[3:], 0.0), axis=-1)
 
 
@@ -60,8 +59,7 @@ def to_circle(points, circle):
 def to_segments(points, starts, ends):
     """Distances from points to segments (..., 2)."""
     along = ends - starts
-    length = np.maximum(np.sum(along**2, -1), 1e-30)
-    share = np.clip(np.sum((points - starts) * along, -1) / length, 0, 1)
+    share = np.clip(np.sum((points - starts) * along, -1) / np.maximum(np.sum(along**2, -1), 1e-30), 0, 1)
     return np.linalg.norm(points - starts - share[..., None] * along, axis=-1)
 
 

@@ -29,8 +29,7 @@ def plan(labels=20, kind="relative", base=None, config=probes.CONFIG, **others):
 def expert(item, eps_deg=probes.SCALARS.eps_deg):
     """Return the expert's answer: the side of its best action, or 0 within half of eps (by angles)."""
     best = np.asarray(ENV.best(item.guide.obs), float)
-    cross = item.action[0] * best[1] - item.action[1] * best[0]
-    apart = np.degrees(np.arctan2(cross, item.action @ best))
+    apart = np.degrees(np.arctan2(item.action[0] * best[1] - item.action[1] * best[0], item.action @ best))
     return np.array([0.0 if abs(apart) <= eps_deg / 2 else np.sign(apart)], np.float32)
 
 

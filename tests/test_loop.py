@@ -64,8 +64,7 @@ def test_the_agent_learns_a_bandit_by_itself():
 
 
 def reward_of(params):
-    key = jax.random.key(7)
-    measured = evaluate.rollout_lanes(ENV, Agent(params, probes.FUNCTIONS), key, 40, 80, mesh=MESH).means
+    measured = evaluate.rollout_lanes(ENV, Agent(params, probes.FUNCTIONS), jax.random.key(7), 40, 80, mesh=MESH).means
     np.testing.assert_array_equal(measured["reward"], measured["hit"])
     return np.asarray(measured["reward"])
 

@@ -80,8 +80,7 @@ def next_unit(
 ) -> Float[Array, "..."]:
     """Return the unit of the bins [reward] after batch number `count` (from 1): a running root mean square."""
     square = jnp.mean(jnp.square(rewards / jnp.maximum(1 - discount, 1e-3) / ROOM))
-    rate = jnp.maximum(1 / count, RATE)
-    return jnp.sqrt(jnp.square(unit) + rate * (square - jnp.square(unit)) + 1e-12)
+    return jnp.sqrt(jnp.square(unit) + jnp.maximum(1 / count, RATE) * (square - jnp.square(unit)) + 1e-12)
 
 
 def with_unit_weights(critic: Params) -> Params:

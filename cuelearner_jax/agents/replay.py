@@ -249,8 +249,7 @@ def n_step_return(
     else 1. Returns the sum; the factor of the value of the last step's next observation, short of one `discount`, as
     `Transition.discount` has it; the last step's index.
     """
-    before_end = jnp.cumprod(jnp.concatenate([jnp.ones(1), 1.0 - ended[:-1]]))
-    counts = before_end * exists
+    counts = jnp.cumprod(jnp.concatenate([jnp.ones(1), 1.0 - ended[:-1]])) * exists
     powers = jnp.power(jnp.asarray(discount, rewards.dtype), jnp.arange(rewards.shape[0]))
     last = counts.sum().astype(jnp.int32) - 1
     return jnp.sum(counts * powers * rewards), powers[last] * discounts[last], last

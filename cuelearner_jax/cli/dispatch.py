@@ -87,6 +87,5 @@ def _dispatch(arguments: list[str]) -> int:
     from cuelearner_jax import devices, user_code
 
     devices.fix_numerics()
-    run = importlib.import_module(f"cuelearner_jax.cli.{command}").run
-    user_code.report_user_errors(run)(arguments[1:])
+    user_code.report_user_errors(importlib.import_module(f"cuelearner_jax.cli.{command}").run)(arguments[1:])
     return 0

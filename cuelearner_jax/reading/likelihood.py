@@ -65,8 +65,7 @@ def intervals(
 def log_likelihood(change: Float[Array, "n cues"], answers: Answers, habits: Habits) -> Float[Array, "n cues"]:
     """Return log p(answer | change) of each cue, 0 where nothing was said."""
     upper, lower = (ndtr(end) for end in _ends(change, answers, habits))
-    log_p = jnp.log((1 - habits.lapse) * (upper - lower) + habits.lapse / 3)
-    return jnp.where(answers.valid, log_p, 0.0)
+    return jnp.where(answers.valid, jnp.log((1 - habits.lapse) * (upper - lower) + habits.lapse / 3), 0.0)
 
 
 def _ends(change: Array, answers: Answers, habits: Habits) -> tuple[Array, Array]:

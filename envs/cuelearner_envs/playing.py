@@ -24,8 +24,7 @@ def record_steps(
         def advance(carry: Any, number: jax.Array) -> Any:
             state, obs = carry
             k_act, k_step = jax.random.split(jax.random.fold_in(k_play, number))
-            states = jax.tree.map(lambda leaf: leaf[None], state)
-            action = policy.act(k_act, states, obs[None])[0]
+            action = policy.act(k_act, jax.tree.map(lambda leaf: leaf[None], state), obs[None])[0]
             following, step = env.step(k_step, state, action)
             return (following, step.obs), see(env, state, action, step)
 

@@ -163,14 +163,12 @@ def test_without_a_simulator_held_out_answers_decide():
     base = Common(Shifted(jnp.array(-25.0)))
     one = own_labels(-25.0, 40)
     chance = np.random.default_rng(1).choice([-1.0, 0.0, 0.0, 0.0, 1.0], (1, 40, 1)).astype(np.float32)
-    noise = one.replace(answer=chance)
-    both = jax.tree.map(lambda *leaves: np.concatenate(leaves), one, noise)
+    both = jax.tree.map(lambda *leaves: np.concatenate(leaves), one, one.replace(answer=chance))
     judged = by_model.adapt(of(base), lanes, how, labels=both, mesh=MESH).judgement
     assert judged.by == "labels"
     assert judged.rewarded_steps.tolist() == [0, 0]
     assert (judged.before[0], judged.after[0], judged.in_use[0]) == (0.0, 1.0, True)
-    held = chance[0, 3::5, 0]
-    assert judged.before[1] == pytest.approx((held == 0).mean())
+    assert judged.before[1] == pytest.approx((chance[0, 3::5, 0] == 0).mean())
     assert judged.after[1] <= judged.before[1]
     few = begin(of(), product(1, (0,), (4,), (10.0,)))
     with pytest.raises(UserError, match="fewer than 5 labels"):

@@ -23,8 +23,7 @@ FULL = ddqn.DDQNConfig(q_layers=LAYERS, directions=360)
 
 def chosen(options, params, obs):
     """What an agent of five-number observations does while it learns."""
-    functions = options.make("raw", Spaces(5, DIRECTIONS))
-    return functions.explore(None, options, params, obs, jax.random.key(0))
+    return options.make("raw", Spaces(5, DIRECTIONS)).explore(None, options, params, obs, jax.random.key(0))
 
 
 def agent(key=0, scale=3.0):
@@ -73,8 +72,7 @@ def test_the_quick_choice_of_a_network_is_the_full_one(coarse):
 
 def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
     obs, params = jax.random.normal(jax.random.key(1), (64, 5)), agent()
-    rough = dataclasses.replace(FULL, coarse_directions=60, coarse_dtype="bfloat16", peaks=4)
-    found = chosen(rough, params, obs)
+    found = chosen(dataclasses.replace(FULL, coarse_directions=60, coarse_dtype="bfloat16", peaks=4), params, obs)
     q = as_function(q_network(LAYERS))
     values = jax.vmap(lambda seen: q(params, seen, evenly_spaced(360))[:, 0])(obs)
     taken = jax.vmap(lambda seen, action: q(params, seen, action)[0])(obs, found)

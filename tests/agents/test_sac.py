@@ -53,8 +53,7 @@ def test_the_density_integrates_to_one_and_draws_follow_it():
 
 
 def test_the_density_is_finite_where_tanh_is_one():
-    far = jnp.array([[60.0, -60.0]])
-    found = sac.squashed_log_density(jnp.zeros((1, 2)), jnp.zeros((1, 2)), far)
+    found = sac.squashed_log_density(jnp.zeros((1, 2)), jnp.zeros((1, 2)), jnp.array([[60.0, -60.0]]))
     # log(1 - tanh(u)^2) is log 4 - 2 |u| far out.
     assert float(found[0]) == pytest.approx(2 * (120 - math.log(4) - 0.5 * math.log(2 * math.pi)), rel=1e-5)
 
@@ -174,8 +173,7 @@ def update_of(still):
 def updated(options):
     """Parameters and the rest before an update, and what it returns."""
     before = agent_of(options).init(KEY)
-    scalars = dataclasses.replace(probes.SCALARS, discount=0.9)
-    return before, update_of(static(options))(options, scalars, *before)
+    return before, update_of(static(options))(options, dataclasses.replace(probes.SCALARS, discount=0.9), *before)
 
 
 def steps_of(opt_state):

@@ -36,8 +36,7 @@ SEEN = np.stack([np.cos(ANGLES), np.sin(ANGLES)], -1).astype(np.float32)
 
 def turned(directions, degrees):
     angle = np.radians(degrees)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    return np.asarray(directions) @ turn.T
+    return np.asarray(directions) @ np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]).T
 
 
 def best(obs):
@@ -51,8 +50,7 @@ def policy(obs):
 
 def errors(acting):
     """Mean distance from the best actions [deg]."""
-    chosen = acting(SEEN)
-    return np.degrees(np.arccos(np.clip((chosen * best(SEEN)).sum(-1), -1, 1))).mean()
+    return np.degrees(np.arccos(np.clip((acting(SEEN) * best(SEEN)).sum(-1), -1, 1))).mean()
 
 
 def own_labels():

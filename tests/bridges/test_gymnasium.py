@@ -284,8 +284,7 @@ def test_what_is_neither_success_nor_a_choice_is_refused():
 
 def test_choices_count_from_the_start_of_the_space_and_integers_are_rounded():
     assert measured(short(actions=spaces.Discrete(3, start=-1)), lambda obs: np.zeros(len(obs), int))["return"] == -1
-    whole = short(actions=spaces.Box(0, 9, (1,), np.int64))
-    assert measured(whole, lambda obs: 0 * obs + 2.7)["return"] == 3
+    assert measured(short(actions=spaces.Box(0, 9, (1,), np.int64)), lambda obs: 0 * obs + 2.7)["return"] == 3
     tenth = short(actions=spaces.Box(-0.1, 0.1, (1,), np.float64))  # in single precision 0.1 is more
     assert measured(tenth, lambda obs: 0 * obs + 1)["return"] == np.float32(0.1)
 

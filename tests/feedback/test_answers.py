@@ -181,8 +181,7 @@ def test_a_teacher_of_the_worst_cue_says_nothing_of_the_others(change, all_cues,
     best = SMALL.exp(action, jnp.array(change, jnp.float32))
     key = jax.random.key(0)
     for says, expected in (("all", all_cues), ("worst", worst)):
-        scalars = dataclasses.replace(SCALARS, eps_deg=0.1, says=says)
-        answer, answered = human_answer(key, SMALL, action, best, scalars)
+        answer, answered = human_answer(key, SMALL, action, best, dataclasses.replace(SCALARS, eps_deg=0.1, says=says))
         np.testing.assert_array_equal(answer, [UNSAID if h is None else h for h in expected])
         assert bool(answered)
 

@@ -39,8 +39,7 @@ def test_indifference_widens_what_is_right_and_never_narrows_it():
 
 @pytest.mark.parametrize("eps_deg", [0.1, 20.0, 179.0])
 def test_feedback_is_the_turn_that_comes_nearest(eps_deg):
-    rng = np.random.default_rng(int(eps_deg * 10))
-    action, best = rng.uniform(-math.pi, math.pi, (2, 2000))
+    action, best = np.random.default_rng(int(eps_deg * 10)).uniform(-math.pi, math.pi, (2, 2000))
     both = (directions.from_angle(jnp.array(angles)) for angles in (action, best))
     h = jax.vmap(partial(relative_feedback, DIRECTIONS), (0, 0, None))(*both, jnp.array(eps_deg * DEG))
     turns = np.array([-1, 0, 1])
@@ -76,8 +75,7 @@ def label_set(seed, noise=0.0, valid=ROWS, dtype=np.float32):
 
 
 def mean_error(model, labels, rows):
-    found = predict(model.params, jnp.asarray(labels.obs), jnp.asarray(labels.action))
-    error = np.asarray(found) - labels.target
+    error = np.asarray(predict(model.params, jnp.asarray(labels.obs), jnp.asarray(labels.action))) - labels.target
     return float(np.square(error).sum(-1)[rows].mean())
 
 

@@ -201,6 +201,5 @@ def test_files_in_onnx_that_do_not_fit_are_told(stored, tmp_path):
         policy_of(tmp_path / "damaged.onnx")
     with pytest.raises(UserError, match=r"reading .*model.zip may run code in it.* give my_policy:POLICY"):
         policy_of(tmp_path / "model.zip")
-    path = stored()
-    assert "Got: 2 Expected: 3" in fault(path, OBS[:, :2])
+    assert "Got: 2 Expected: 3" in fault(stored(), OBS[:, :2])
     assert "not finite" in fault(stored(matrix=np.full((3, 2), np.nan)))

@@ -73,8 +73,7 @@ def test_members_that_are_the_same_do_what_one_does_and_do_not_disagree(kind):
     np.testing.assert_allclose(one.actions, mean.actions, atol=1e-5)
     np.testing.assert_allclose(several.disagreement(same, ENV, OBS, BASE), 0, atol=1e-10)
     add = jax.vmap(lambda number, params: jax.tree.map(lambda leaf: leaf + 0.1 * number, params))
-    differing = same.replace(params=add(jnp.arange(4.0), same.params))
-    assert several.disagreement(differing, ENV, OBS, BASE).min() > 1e-6
+    assert several.disagreement(same.replace(params=add(jnp.arange(4.0), same.params)), ENV, OBS, BASE).min() > 1e-6
 
 
 # Which question.

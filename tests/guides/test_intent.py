@@ -145,8 +145,7 @@ def test_actions_stay_where_it_is_likelier_by_far_that_none_is_meant():
         goal, found = intent.choose_aim(DIRECTIONS, share, aims, aims[0], 2.0)
         np.testing.assert_array_equal(goal, aims[1])
         assert bool(found) == sure
-    impossible = jnp.array([0.0, 0.0, 0.0, 1.0])
-    assert not intent.choose_aim(DIRECTIONS, impossible, aims, aims[0], 2.0)[1]
+    assert not intent.choose_aim(DIRECTIONS, jnp.array([0.0, 0.0, 0.0, 1.0]), aims, aims[0], 2.0)[1]
 
 
 def test_of_aims_as_likely_as_the_likeliest_the_nearest_is_followed():
@@ -167,8 +166,7 @@ def test_members_weigh_aims_each_by_itself_and_their_mean_leads():
     members = [jax.tree.map(lambda leaf, i=i: leaf[i], model.params) for i in range(3)]
     assert not np.array_equal(*(one["params"]["Dense_0"]["kernel"] for one in members[1:]))
     # One that believes in no aim does not decide for the others, however sure it is.
-    odd = {"params": members[0]["params"] | {"none": jnp.array([50.0])}}
-    members = [odd, *members[1:]]
+    members = [{"params": members[0]["params"] | {"none": jnp.array([50.0])}}, *members[1:]]
     outvoted = model.replace(params=jax.tree.map(lambda *leaves: jnp.stack(leaves), *members))
     np.testing.assert_array_equal(acted((bundle, outvoted), ENV).actions, lead)
     network, aims = intent.Weights(OPTIONS.aim_layers), ENV.aims(OBS[0])

@@ -83,8 +83,7 @@ def test_a_share_of_the_scalar_questions_explores():
         asks = dataclasses.replace(bundle, options=dataclasses.replace(bundle.options, explored_fraction=explored))
         scalars = dataclasses.replace(SCALARS, refined_fraction=refined)
         ask = jax.jit(jax.vmap(lambda key: asks.question(key, model, ENV, OBS[0], BEST[0], scalars)))  # noqa: B023
-        found = ask(keys)
-        about_own = (np.abs(np.asarray(found) - np.asarray(own)).max(-1) < 1e-5).mean()
+        about_own = (np.abs(np.asarray(ask(keys)) - np.asarray(own)).max(-1) < 1e-5).mean()
         assert about_own == pytest.approx((1 - explored) * refined, abs=0.08)  # standard deviation 0.025
 
 

@@ -53,8 +53,7 @@ def drawn(key, count):
     wind = retract(jax.random.normal(k_wind, (count, 2)))
     angle = jnp.arange(BEAMS) * (2 * jnp.pi / BEAMS)
     centre = jax.random.uniform(k_beams, (count, 1), maxval=2 * jnp.pi)
-    beams = jnp.exp(2 * (jnp.cos(angle[None] - centre) - 1))
-    return jnp.concatenate([places, wind, beams], -1)
+    return jnp.concatenate([places, wind, jnp.exp(2 * (jnp.cos(angle[None] - centre) - 1))], -1)
 
 
 @jax.jit
@@ -63,8 +62,7 @@ def aims(obs):
     ball, pocket, wind, beams = obs[:, :2], obs[:, 2:4], obs[:, 4:6], obs[:, 6:]
     angle = jnp.arange(BEAMS) * (2 * jnp.pi / BEAMS)
     near = jnp.stack([beams @ jnp.cos(angle), beams @ jnp.sin(angle)], -1) / BEAMS
-    toward = retract(0.15 - ball) + 0.7 * retract(pocket + 0.1) + 0.4 * wind - 1.5 * near
-    return retract(toward)
+    return retract(retract(0.15 - ball) + 0.7 * retract(pocket + 0.1) + 0.4 * wind - 1.5 * near)
 
 
 @jax.jit

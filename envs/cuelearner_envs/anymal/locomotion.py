@@ -56,8 +56,7 @@ def random_command(key: PRNGKeyArray, trial: Trial) -> Float[Array, "3"]:
     velocity = from_angle(jax.random.uniform(k_angle, (), minval=-jnp.pi, maxval=jnp.pi))
     velocity = velocity * jax.random.uniform(k_speed) * trial.speed
     turning = jax.random.uniform(k_turn, (1,), minval=-1.0, maxval=1.0) * trial.turning
-    moving = ~jax.random.bernoulli(k_rest, trial.rest)
-    return jnp.concatenate([velocity, turning]) * moving
+    return jnp.concatenate([velocity, turning]) * (~jax.random.bernoulli(k_rest, trial.rest))
 
 
 def random_ground(key: PRNGKeyArray, trial: Trial) -> AnymalGround:

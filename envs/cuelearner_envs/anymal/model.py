@@ -65,8 +65,7 @@ def in_body(turn: Float[Array, "3 3"], vector: Float[Array, "3"]) -> Float[Array
 def planar_pose(qpos: Float[Array, "19"]) -> Float[Array, "3"]:
     """x, y and yaw of the trunk [m, rad]."""
     w, x, y, z = qpos[3:7]
-    yaw = jnp.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
-    return jnp.stack([qpos[0], qpos[1], yaw])
+    return jnp.stack([qpos[0], qpos[1], jnp.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))])
 
 
 def planar_velocity(qpos: Float[Array, "19"], qvel: Float[Array, "18"]) -> Float[Array, "3"]:

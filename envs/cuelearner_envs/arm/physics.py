@@ -95,8 +95,7 @@ def command(
     meets = (away < KEPT_OUT) & (target[2] < OVER) & (post > 0)
     around = middle + off * (KEPT_OUT / jnp.maximum(away, 1e-3))
     beside = jnp.concatenate([around, target[2:]])
-    above = target.at[2].set(OVER)
-    target = jnp.where(meets, jnp.where(gripper[2] < OVER - 0.002, beside, above), target)
+    target = jnp.where(meets, jnp.where(gripper[2] < OVER - 0.002, beside, target.at[2].set(OVER)), target)
     return Command(target, grasps * jnp.clip(fingers + action[3], 0.0, arm.OPEN))
 
 

@@ -55,8 +55,7 @@ def sketch(env: Arm, state: Situation) -> Sketch:
 @jax.jit
 def _held(env: Arm, state: Situation, action: Array) -> Situation:
     def one(state: Situation, _: None) -> tuple[Situation, Situation]:
-        body = physics.control(state.body, env.command(state, action), env.ground)
-        after = env.after(state, body)
+        after = env.after(state, physics.control(state.body, env.command(state, action), env.ground))
         return after, after
 
     return jax.lax.scan(one, state, length=HELD)[1]

@@ -47,8 +47,7 @@ def past(obs: Observations, side: Amount = 0.0, friction: Amount = 1.0, post: Am
 def _aim(cube: Float[Array, "n 2"], goal: Float[Array, "n 2"], side: Amount) -> Float[Array, "n 2"]:
     """Return the point to push the cube to next: the goal, or along the tangent to a circle around the post."""
     way, to_post = goal - cube, jnp.asarray(arm.POST_PLACE)[None] - cube
-    length = jnp.maximum(jnp.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
-    ahead = way / length
+    ahead = way / jnp.maximum(jnp.linalg.norm(way, axis=-1, keepdims=True), 1e-6)
     along = jnp.sum(to_post * ahead, -1, keepdims=True)  # how far ahead the post is, and how far to the left
     beside = ahead[:, :1] * to_post[:, 1:] - ahead[:, 1:] * to_post[:, :1]
     which = jnp.where(side == 0, jnp.where(beside < 0, 1.0, -1.0), side)
@@ -81,8 +80,7 @@ def pick(obs: Observations, friction: Amount = 1.0) -> Float[Array, "n 4"]:
     most = jnp.where(jnp.asarray(friction) < SLIPPERY, CARRIED, 1.0)
     carrying = jnp.clip(CARRY_GAIN * (goal - cube), -most, most)
     move = jnp.where(is_held, carrying, jnp.where(is_between, GAIN * off, coming))
-    fingers = jnp.where(is_held | is_between, -1.0, 1.0)
-    return jnp.clip(jnp.concatenate([move, fingers], -1), -1.0, 1.0)
+    return jnp.clip(jnp.concatenate([move, jnp.where(is_held | is_between, -1.0, 1.0)], -1), -1.0, 1.0)
 
 
 def act(

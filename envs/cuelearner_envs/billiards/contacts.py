@@ -101,8 +101,7 @@ def next_on_edge(table: Table, x: Each, y: Each, ux: Each, uy: Each) -> Flight:
         time_to_line(half_x + table.pocket_margin - out_x, speed_x),
         time_to_line(half_y + table.pocket_margin - out_y, speed_y),
     )
-    falls = pocket < best
-    return Flight(jnp.minimum(best, pocket), best_x, best_y, falls)
+    return Flight(jnp.minimum(best, pocket), best_x, best_y, pocket < best)
 
 
 def normal_impulse(approach: Each | float, unseen: Each | float, restitution: Scalar, discs: Each | float) -> Each:

@@ -103,8 +103,7 @@ class Billiards(WholeObservations, struct.PyTreeNode):
         """Targets in the order of an observation, the pocketed ones in their row beside the table."""
         pocketed = targets[:, 2] > 0
         order = jnp.lexsort((targets[:, 0], -targets[:, 1], ~pocketed))
-        row = jnp.asarray(parking(self.table))[1:]
-        placed = jnp.where(pocketed[order, None], row, targets[order, :2])
+        placed = jnp.where(pocketed[order, None], jnp.asarray(parking(self.table))[1:], targets[order, :2])
         return jnp.concatenate([placed, targets[order, 2:]], axis=-1)
 
     def heuristic(self, obs: Float[Array, " obs"]) -> Float[Array, "2"]:

@@ -31,8 +31,7 @@ def in_frame(boxes: Float[Array, "boxes 5"], point: Float[Array, "2"]) -> Float[
 def clearance(world: NavigationWorld, point: Float[Array, "2"]) -> Float[Array, ""]:
     """Distance from a point to the nearest solid [m]; negative inside one."""
     beyond = jnp.abs(in_frame(world.boxes, point)) - world.boxes[:, 3:]
-    outside = jnp.sqrt(jnp.sum(jnp.square(jnp.maximum(beyond, 0.0)), -1))
-    to_boxes = outside + jnp.minimum(beyond.max(-1), 0.0)
+    to_boxes = jnp.sqrt(jnp.sum(jnp.square(jnp.maximum(beyond, 0.0)), -1)) + jnp.minimum(beyond.max(-1), 0.0)
     to_circles = jnp.sqrt(jnp.sum(jnp.square(point[None] - world.circles[:, :2]), -1)) - world.circles[:, 2]
     return jnp.minimum(to_boxes.min(), to_circles.min())
 

@@ -100,8 +100,7 @@ def _wall_with_door(key: PRNGKeyArray, ends: Float[Array, "4"]) -> Float[Array, 
     centres = jnp.stack([start + direction * pieces[0] / 2, end - direction * pieces[1] / 2])
     yaw = jnp.arctan2(direction[1], direction[0])
     shape = jnp.stack([pieces / 2, jnp.full(2, thickness)], -1)
-    walls = jnp.concatenate([centres, jnp.full((2, 1), yaw), shape], axis=-1)
-    return _only(pieces > 0.2, walls)
+    return _only(pieces > 0.2, jnp.concatenate([centres, jnp.full((2, 1), yaw), shape], axis=-1))
 
 
 def _draw(count: int, *columns: tuple[PRNGKeyArray, int, Any, Any]) -> Float[Array, "count width"]:

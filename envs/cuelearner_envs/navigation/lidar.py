@@ -124,8 +124,7 @@ def _boxes(
     in_x, in_y = products(enter)
     entered = jnp.minimum(in_x + unbounded[:, 0, None], in_y + unbounded[:, 1, None])
     leaving = jnp.maximum(jnp.maximum(*products(leave_behind)), jnp.maximum(*products(leave_ahead)))
-    inverse = jnp.where(within[:, None], leaving, entered)
-    return jnp.where(entered >= leaving, inverse, 0.0)
+    return jnp.where(entered >= leaving, jnp.where(within[:, None], leaving, entered), 0.0)
 
 
 def _circles(

@@ -47,8 +47,7 @@ def build(key: PRNGKeyArray, world: NavigationWorld, robot: Robot) -> RoadMap:
     nodes, useful = candidates[order], (free & inside)[order]
     clear = jax.vmap(lambda a: jax.vmap(lambda b: line_clearance(world, a, b))(nodes))(nodes)
     joined = (clear >= robot.reach + LINE_MARGIN) & useful[:, None] & useful[None]
-    apart = jnp.linalg.norm(nodes[:, None] - nodes[None], axis=-1)
-    return RoadMap(nodes, jnp.where(joined, apart, jnp.inf))
+    return RoadMap(nodes, jnp.where(joined, jnp.linalg.norm(nodes[:, None] - nodes[None], axis=-1), jnp.inf))
 
 
 def distances(
@@ -95,8 +94,7 @@ def _room(
 ) -> Float[Array, ""]:
     """Clearance of a line beyond what it must have [m]: the map's, or that of its worse end."""
     ends = jnp.minimum(clearance(world, position), clearance(world, place))
-    needed = jnp.minimum(robot.reach + LINE_MARGIN, ends - YIELD)
-    return line_clearance(world, position, place) - needed
+    return line_clearance(world, position, place) - jnp.minimum(robot.reach + LINE_MARGIN, ends - YIELD)
 
 
 def _candidates(

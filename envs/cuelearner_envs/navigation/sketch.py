@@ -90,8 +90,7 @@ def reel(env: Navigation, state: Any, action: Float[Array, "2"]) -> Reel:
     frames: list[dict[str, tuple[float, float, float] | None]] = [{"robot": (0.0, 0.0, -90.0)}]
     for pose in poses[: last + 1]:
         x, y = _placed(pose[None, :2], start)[0]
-        turned = math.degrees(float(pose[2]) - start[2])
-        frames.append({"robot": (float(x), float(y), -90.0 - turned)})
+        frames.append({"robot": (float(x), float(y), -90.0 - math.degrees(float(pose[2]) - start[2]))})
     return Reel(period / 2, frames, f"held for {(last + 1) * period:.1f} s: {how}")
 
 

@@ -95,8 +95,7 @@ def closed(world: NavigationWorld, side: Float[Array, ""] | float) -> Navigation
     x, y = middles[:, 0], middles[:, 1]
     zero, thin = jnp.zeros(len(middles)), jnp.full(len(middles), BARRIER)
     barrier = jnp.stack([x, (y + wall) / 2, zero, thin, jnp.abs(wall - y) / 2], axis=-1)
-    unused = jnp.array([FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01])
-    barriers = jnp.where(there[:, None], barrier, unused[None])
+    barriers = jnp.where(there[:, None], barrier, jnp.array([FAR_AWAY, FAR_AWAY, 0.0, 0.01, 0.01])[None])
     heights = jnp.full(len(middles), world.box_heights[0])
     return world.replace(
         boxes=jnp.concatenate([world.boxes, barriers]), box_heights=jnp.concatenate([world.box_heights, heights])

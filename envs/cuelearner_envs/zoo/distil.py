@@ -67,8 +67,7 @@ def distil(key: PRNGKeyArray, robot: ZooRobot) -> ZooRobot:
         rows = (number + 1) * EPISODES * STEPS
         steps = lambda carry, key: fit(data, rows, carry, key)  # noqa: E731
         (layers, moments), _ = jax.lax.scan(steps, (layers, moments), jax.random.split(k_fit, FITTING))
-        pupil = robot.replace(neural=jnp.array(True), net=net | {"layers": layers})
-        obs, _ = _play(k_play, pupil, EPISODES)
+        obs, _ = _play(k_play, robot.replace(neural=jnp.array(True), net=net | {"layers": layers}), EPISODES)
         return (jax.lax.dynamic_update_slice(data, obs.reshape(-1, size), (rows, 0)), layers, moments), None
 
     data = jnp.zeros(((ROUNDS + 1) * EPISODES * STEPS, size)).at[: flat.shape[0]].set(flat)

@@ -180,8 +180,7 @@ def script(robot: ZooRobot, way: Way, sight: Sight) -> Float[Array, " n"]:
     lifts = (height > SURFACE) & (jnp.linalg.norm(lateral) > 0.6 * narrow(robot))
     above = sight.goal + robot.axis * jnp.where(lifts, ABOVE, 0.0)
     before = jnp.where(sight.carries > 0.5, sight.goal + sight.position - sight.thing, sight.thing)
-    targets = [sight.goal, sight.goal, sight.goal, above, before]
-    rest = jnp.stack(targets)[robot.task] - sight.position
+    rest = jnp.stack([sight.goal, sight.goal, sight.goal, above, before])[robot.task] - sight.position
     ahead = robot.first * jnp.dot(robot.first, rest)
     rest = jnp.where(way.in_turn & (jnp.abs(jnp.dot(robot.first, rest)) > 0.06), ahead, rest)
     speed = way.gain * rest
@@ -210,8 +209,7 @@ def _go_round(way: Way, sight: Sight, speed: Float[Array, " n"]) -> Float[Array,
     side, _ = _unit(way.side - jnp.dot(way.side, ahead) * ahead)
     tangent, _ = _unit(side - jnp.dot(side, away) * away)
     near = jnp.clip((way.detour * radius - apart) / (0.6 * radius), 0.0, 1.0)
-    inward = jnp.minimum(jnp.dot(speed, away), 0.0)
-    return speed - near * inward * (away + tangent)
+    return speed - near * jnp.minimum(jnp.dot(speed, away), 0.0) * (away + tangent)
 
 
 def _unit(vector: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, ""]]:

@@ -71,8 +71,7 @@ def test_still_shows_solids_way_end_and_goal(frames, tmp_path):
     for offset, green in ((0.4, True), (0.6, False)):  # within the goal's radius of 0.5 m and beyond
         red, tint, _ = pixel(last.goal[0], last.goal[1] + offset)
         assert (tint - red > 0.08) == green
-    between = (frames[1].pose[:2] + frames[2].pose[:2]) / 2
-    assert not is_colour(pixel(*between), drawing.FLOOR, 0.1)
+    assert not is_colour(pixel(*((frames[1].pose[:2] + frames[2].pose[:2]) / 2)), drawing.FLOOR, 0.1)
 
 
 def test_a_question_shows_the_first_situation_and_the_direction_in_question(frames, tmp_path):

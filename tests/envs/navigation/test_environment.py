@@ -116,8 +116,7 @@ def test_the_goal_is_reached_within_its_radius():
 def test_touching_a_wall_ends_the_episode(pose, action, room):
     turning = room is None
     room = np.array([0, -1]) if turning else np.array(room)
-    limit = HALL.robot.replace(turn_rate=jnp.float32(0.0 if turning or action is BACK else 1.5))
-    env = HALL.replace(robot=limit)
+    env = HALL.replace(robot=HALL.robot.replace(turn_rate=jnp.float32(0.0 if turning or action is BACK else 1.5)))
     place = np.array(pose[:2])
     for slack, collision in ((0.003, False), (-0.003, True)):
         _, result = step(env, walker((*(place + slack * room), pose[2])), action)

@@ -61,8 +61,7 @@ def test_the_way_to_a_doorway_leads_on_and_the_wall_does_not():
     # Straight at the wall the second leg is at best 60 degrees aside along it: what is left is beyond.
     assert left[0] > 2.0
     assert left[-to_gap] > 2.0
-    inner = np.r_[0 : to_gap - 3, -to_gap:0]
-    assert left[inner].min() > left[to_gap] + 1.0
+    assert left[np.r_[0 : to_gap - 3, -to_gap:0]].min() > left[to_gap] + 1.0
 
 
 def test_what_is_seen_of_a_wall_stops_a_second_leg_and_what_is_not_seen_does_not():

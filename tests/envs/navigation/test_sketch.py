@@ -42,8 +42,7 @@ def test_what_lies_ahead_is_above_and_what_lies_to_the_left_is_on_the_left():
 
 
 def test_a_film_walks_where_the_direction_leads():
-    state = standing(-4.0, 0.0, 0.0, [4.0, 0.0])
-    film = reel(ENV, state, jnp.array([0.0, 1.0]))
+    film = reel(ENV, standing(-4.0, 0.0, 0.0, [4.0, 0.0]), jnp.array([0.0, 1.0]))
     assert film.frames[0]["robot"] == (0.0, 0.0, -90.0)
     x, y, turn = film.frames[-1]["robot"]
     assert x < -1.5  # to the left on the screen
