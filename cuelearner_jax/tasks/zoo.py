@@ -89,7 +89,7 @@ def task_of(name: str) -> Task:
     def environment(world: ZooConfig, split: str) -> ZooEnvironment:
         if world.cues != config.cues:  # the preset's strength of answers is that of its own space
             raise UserError(f"task.cues is {world.cues}: name zoo:{world.cues} in place of zoo:{name}")
-        return ROBOT.environment(world, split)
+        return ZooEnvironment.of(_world(world))
 
     bodies = (dataclasses.replace(ROBOT, environment=environment),)
     return dataclasses.replace(ZOO, default=config, bodies=bodies, presets={"paper": preset})
