@@ -217,7 +217,8 @@ def _second(plan: SessionPlan, options: LabelOptions, path: Path) -> SessionPlan
         raise UserError("--again repeats another page's questions: leave out the policy, --seed and --bound-deg")
     world = file.task | {"robot": file.session.get("robot", ""), "answers": file.answers, "eps": file.eps}
     for name, value in (plan.world | {"robot": plan.robot, "answers": plan.form.name, "eps": plan.eps}).items():
-        if name != "path" and (before := world.get(name)) != value:  # a recording may lie elsewhere
+        is_place = name == "path" and plan.task.name == logs.NAME  # a recording may lie elsewhere
+        if not is_place and (before := world.get(name)) != value:
             raise UserError(f"{path} asked in a world with another {name} ({before!r}, not {value!r}): give the same")
     place = label_files.found_in(path)
     assert place is not None  # the file was read above

@@ -97,7 +97,8 @@ def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
         if len(np.unique(file.seeds)) > 1:
             raise UserError("a file holds the labels of several seeds: merge files of one seed each")
         worlds = ({**one.task, "answers": one.answers, "space": one.space, "eps": one.eps} for one in (first, file))
-        own, other = ({**world, "path": ""} for world in worlds)  # a recording may lie elsewhere
+        apart = {"path": ""} if "digest" in first.task else {}  # a recording, which its digest tells, may lie elsewhere
+        own, other = ({**world, **apart} for world in worlds)
         for name in own | other:
             if (before := own.get(name)) != (now := other.get(name)):
                 raise UserError(f"the files differ in {name} ({before}, {now}): merge only files that agree in it")

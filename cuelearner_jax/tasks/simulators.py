@@ -156,7 +156,7 @@ def _family(name: str, about: str, physics: str, config: type) -> Task:
         (body,),
         longest=lambda config: config.max_steps,
         judge_by=lambda config: "return",
-        labels_hold=("max_steps", VARIANTS[name]),
+        labels_hold=("max_steps", "privileged", VARIANTS[name]),
     )
 
 

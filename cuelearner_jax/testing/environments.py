@@ -53,8 +53,8 @@ def _check_shapes(laws: Laws, env: Environment) -> None:
     laws.hold(shapes_of(after) == shapes_of(state), "`step` returns a state of other fields, shapes or types")
     memory = jax.eval_shape(env.remember, state, obs)
     following = jax.eval_shape(env.recall_next, memory, action, step.aftermath)
-    count = getattr(env, "privileged", 0) if isinstance(env, WholeObservations) else 0
-    whole = min(memory.size, step.aftermath.size) >= obs.size + count
+    count, is_whole = getattr(env, "privileged", 0), isinstance(env, WholeObservations)
+    whole = not count or min(memory.size, step.aftermath.size) >= count + obs.size * is_whole
     laws.hold(whole, "`privileged` numbers are missing: append them to what `remember` returns and to `Step.aftermath`")
     observations = {"observation": obs, "Step.obs": step.obs, "Step.final_obs": step.final_obs}
     observations |= {"what `recall` gives": jax.eval_shape(env.recall, memory), "what `recall_next` gives": following}

@@ -220,10 +220,12 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
     nobodys = [one._replace(people=None) for one in (file, merged)]
     assert [comparing.merge([one, file])[1] for one in nobodys] == [8, 8]
     assert comparing.merge([file, theirs, nobodys[0]])[1] == 8  # of people who agree both count
-    here, there = (one._replace(task=one.task | {"path": path}) for one, path in ((file, "a"), (theirs, "b")))
+    place = lambda one, path, **more: one._replace(task=one.task | {"path": path, **more})  # noqa: E731
+    here, there = place(file, "a", digest="1"), place(theirs, "b", digest="1")
     assert comparing.merge([here, there])[0].task["path"] == "a"  # one recording, which lay in two places
-    with pytest.raises(UserError, match=r"^the files differ in eps \(20.0, 5.0\)"):
-        comparing.merge([file, theirs._replace(eps=5.0)])
+    for other, says in ((theirs._replace(eps=5.0), r"eps \(20.0, 5.0\)"), (place(theirs, "b"), r"path \(None, b\)")):
+        with pytest.raises(UserError, match=f"^the files differ in {says}"):
+            comparing.merge([file, other])
     narrower = file._replace(labels=file.labels.replace(obs=np.asarray(file.labels.obs)[:, :-1]))
     with pytest.raises(UserError, match="observations differ in size"):
         comparing.merge([file, narrower])

@@ -68,8 +68,7 @@ def test_a_probability_against_one_unguided_seed_has_no_interval(tmp_path):
     for task, guided in (("small", [0.2, 0.4]), ("large", [30.0, 0.0])):
         write(tmp_path / "runs" / f"{task}-none", task, "none", [0.1])
         write(tmp_path / "runs" / f"{task}-relative", task, "relative", guided, 100)
-    report([tmp_path / "runs"], tmp_path / "report")
-    _, relative = table(tmp_path / "report" / "aggregates.csv")
+    _, relative = table(report([tmp_path / "runs"], tmp_path / "report").with_name("aggregates.csv"))
     assert (float(relative["probability_of_improvement"]), relative["probability_of_improvement_lower"]) == (
         0.75,
         "nan",

@@ -245,9 +245,10 @@ def test_the_probe_task_keeps_the_laws(tmp_path):
     ("task", "small"),
     [
         (NAVIGATION, {"worlds": 8, "max_steps": 12, "mirrors": True, "keep_scans": True}),
+        (NAVIGATION, {"worlds": 2, "max_steps": 12}),
         (BILLIARDS, {"table": "regulation", "mirrors": True, "search_directions": 24}),
     ],
-    ids=["navigation", "billiards"],
+    ids=["navigation", "scans again", "billiards"],
 )
 def test_shipped_tasks_keep_the_laws(task, small):
     check_task(task, task.config(**small), steps=24)

@@ -24,7 +24,7 @@ FRAMES = 90  # of a film
 LONGEST = 3.0  # a film [s]: longer shots are shown faster
 TRAIL = 91  # moments of a trail
 TRAIL_SECONDS = 3.0  # so much of a shot a trail tells at most [s]
-LEAST_MOVE = 1e-4  # by how much the way of a ball that is hit bends between two times, at least [m]
+LEAST_MOVE = 1e-4  # by how much a hit bends a ball's way between two times on a level table, at least [m]
 
 
 def rail_width(table: Table) -> float:
@@ -128,12 +128,14 @@ def trails(env: Billiards, state: Balls, actions: Float[Array, "n 2"]) -> list[s
     the cue ball that did.
     """
     shots = zip(*jax.device_get(_rolled(env, state, jnp.asarray(actions))), strict=True)
-    return [_trail(float(env.table.ball_radius), positions, pocketed) for positions, pocketed in shots]
+    tilt = float(np.linalg.norm(np.asarray(env.table.acceleration)))
+    least = LEAST_MOVE + 2 * tilt * (TRAIL_SECONDS / (TRAIL - 1)) ** 2
+    return [_trail(float(env.table.ball_radius), least, positions, pocketed) for positions, pocketed in shots]
 
 
-def _trail(radius: float, positions: np.ndarray, pocketed: np.ndarray) -> str:
-    # A hit bends a ball's way at once, a tilted table hardly does.
-    moves = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=-1) > LEAST_MOVE
+def _trail(radius: float, least: float, positions: np.ndarray, pocketed: np.ndarray) -> str:
+    """Return the ways; `least`: by how much a hit bends one between two times [m], more than a tilted table does."""
+    moves = np.linalg.norm(np.diff(positions, n=2, axis=0), axis=-1) > least
     moves[:, 0] = False
     hit = int(moves.any(axis=1).argmax())  # the first moment at which a target has moved
     numbers = [0, int(moves[hit].argmax())] if moves.any() else [0]

@@ -53,6 +53,6 @@ def test_a_film_ends_as_the_shot_does():
 def test_a_trail_is_that_of_the_ball_that_is_hit_though_a_tilted_table_moves_another():
     times = np.linspace(0, TRAIL_SECONDS, TRAIL)
     along = np.stack([times, 0.01 * times**2, np.maximum(times - 1, 0)], 1)  # ball 1 by a tilt, ball 2 hit after 1 s
-    drawn = _trail(0.03, np.stack([along, along * 0 + [0, 0.5, -0.25]], -1), np.zeros((TRAIL, 3), bool))
+    drawn = _trail(0.03, 1e-4, np.stack([along, along * 0 + [0, 0.5, -0.25]], -1), np.zeros((TRAIL, 3), bool))
     (dashed,) = [line for line in drawn.split("<polyline")[1:] if "dasharray" in line]
     assert ",0.25 " in dashed  # y points down in pictures
