@@ -80,8 +80,7 @@ class QuestionKeys(NamedTuple):
 
 def question_keys(lane_key: PRNGKeyArray, position: Int[Array, ""] | int) -> QuestionKeys:
     """Return the keys of a lane's question number `position`."""
-    key = jax.random.fold_in(jax.random.fold_in(lane_key, Stream.ASK), position)
-    return QuestionKeys(*jax.random.split(key, 4))
+    return QuestionKeys(*jax.random.split(jax.random.fold_in(jax.random.fold_in(lane_key, Stream.ASK), position), 4))
 
 
 def label_slots(budget: int, sizes: GuideSizes) -> int:

@@ -156,8 +156,7 @@ class Lane(NamedTuple):
 
     def keys(self, clock: Clock, state: TrainState) -> Keys:
         """Return the keys of one iteration."""
-        key = jax.random.fold_in(jax.random.fold_in(state.key, Stream.TRAIN), clock.step)
-        return Keys(*jax.random.split(key, 4))
+        return Keys(*jax.random.split(jax.random.fold_in(jax.random.fold_in(state.key, Stream.TRAIN), clock.step), 4))
 
     def iterate(
         self, env: Environment, settings: Settings, clock: Clock, state: TrainState

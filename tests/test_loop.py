@@ -137,8 +137,7 @@ def test_an_episode_is_guided_as_a_whole():
     schedule = dataclasses.replace(CHAIN.schedule, random_steps=2, learn_after=10**9, guidance_until=2000)
     settings = CHAIN.settings._replace(schedule=schedule)
     _, state, _ = chain_program().train(env, settings, loop.start_clock(), state, 1000)
-    met = probes.stored(state, 0, 2000)
-    turned = np.abs(met["action"] - np.asarray(env.heuristic(None))).max(-1) < 1e-6
+    turned = np.abs(probes.stored(state, 0, 2000)["action"] - np.asarray(env.heuristic(None))).max(-1) < 1e-6
     by_episode = turned.reshape(-1, 2, 2)[1:]  # (episodes, its two steps, environments)
     np.testing.assert_array_equal(by_episode[:, 0], by_episode[:, 1])
     assert by_episode.mean() == pytest.approx(0.5, abs=0.08)

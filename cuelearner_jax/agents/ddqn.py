@@ -204,8 +204,7 @@ class DoubleDQN:
         def one(item: Transition) -> Float[Array, ""]:
             # The online network chooses, the target network values.
             choice = actions[jnp.argmax(self.value(env, params, item.next_obs, actions))]
-            value = self.value(env, target_params, item.next_obs, choice)
-            return target(item.reward, discount * item.discount, value)
+            return target(item.reward, discount * item.discount, self.value(env, target_params, item.next_obs, choice))
 
         # One pass through the networks for both kinds of return: their weights are what has to be read.
         joined = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)

@@ -168,8 +168,7 @@ class Memory(NamedTuple):
         there = self.labelled.filled
         if guided_share is not None:
             return (jnp.arange(size) < jnp.round(guided_share * size)) & (there > 0)
-        own = jnp.clip(self.filled, 1, self.rows.shape[0])
-        return jax.random.uniform(key, (size,)) * (there + own) < there
+        return jax.random.uniform(key, (size,)) * (there + jnp.clip(self.filled, 1, self.rows.shape[0])) < there
 
     def one_step(self, stored: StoredStep) -> Transition:
         """Return stored steps (batch, ...) as transitions, with their observations rebuilt."""

@@ -112,8 +112,7 @@ class Actor(nn.Module):
         x = obs
         for width in self.layers:
             x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.xavier_uniform())(x))
-        both = nn.Dense(2 * self.size, kernel_init=nn.initializers.xavier_uniform())(x)
-        mean, log_std = jnp.split(both, 2, -1)
+        mean, log_std = jnp.split(nn.Dense(2 * self.size, kernel_init=nn.initializers.xavier_uniform())(x), 2, -1)
         return mean, jnp.clip(log_std, *LOG_STD)
 
 

@@ -66,8 +66,7 @@ class JaxEnvironment(Described, struct.PyTreeNode):
         final_obs, ended = flat(after.state.obs), terminated | truncated
         obs, outcome = jnp.where(ended, fresh_obs, final_obs), {"return": after.total}
         metrics = {name: jnp.asarray(value, jnp.float32) for name, value in after.state.metrics.items()}
-        aftermath = self.remember(after, final_obs)
-        step = Step(obs, final_obs, aftermath, reward, terminated, truncated, metrics, outcome)
+        step = Step(obs, final_obs, self.remember(after, final_obs), reward, terminated, truncated, metrics, outcome)
         return jax.tree.map(partial(jnp.where, ended), fresh, after), step
 
     def remember(self, state: SimulatorState, obs: Observation) -> Float[Array, " memory"]:

@@ -149,8 +149,7 @@ def demonstrate(
     """
     mistaken, answered = _slips(key, scalars)
     right = space.distance(action, best) <= space.from_unit(scalars.indifference_deg)
-    mirrored = space.exp(action, -space.log(action, best))
-    return jnp.where(right, action, jnp.where(mistaken, mirrored, best)), answered
+    return jnp.where(right, action, jnp.where(mistaken, space.exp(action, -space.log(action, best)), best)), answered
 
 
 def scalar_answer(
@@ -163,8 +162,7 @@ def scalar_answer(
     mistaken, answered = _slips(key, scalars)
     within = jnp.maximum(space.from_unit(scalars.scalar_within_deg), space.from_unit(scalars.indifference_deg))
     good = space.distance(action, best) <= within
-    label = jnp.where(jnp.isfinite(best).all(), (good != mistaken).astype(jnp.float32), jnp.nan)
-    return label[None], answered
+    return jnp.where(jnp.isfinite(best).all(), (good != mistaken).astype(jnp.float32), jnp.nan)[None], answered
 
 
 def draw_second(key: PRNGKeyArray, space: Space, action: Action, scalars: Any) -> Action:

@@ -156,8 +156,7 @@ def with_moments(params: Params, obs: Float[Array, "n obs"], rows: Bool[Array, "
     if not (isinstance(params, dict) and "obs" in params):
         return params
     mean, variance = networks.moments_of(obs, rows).values()
-    varies = variance > LEAST**2 + jnp.square(1e-6 * mean)
-    moments = {"mean": mean, "variance": jnp.where(varies, variance, NOTHING)}
+    moments = {"mean": mean, "variance": jnp.where(variance > LEAST**2 + jnp.square(1e-6 * mean), variance, NOTHING)}
     return {**params, "obs": jax.tree.map(lambda new, old: jnp.broadcast_to(new, old.shape), moments, params["obs"])}
 
 

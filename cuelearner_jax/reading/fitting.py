@@ -112,8 +112,7 @@ class Reader:
         plain = self._start(frame, labels, plain)
         labels = labels._replace(valid=labels.valid & steady)
         first = self._fit(frame, labels, plain)
-        second = self._fit(frame, labels, _first_and_best(first, smooth)) if self.process else None
-        return _together(first, second)
+        return _together(first, self._fit(frame, labels, _first_and_best(first, smooth)) if self.process else None)
 
     def _ask(self, obs: Float[Array, "*k n obs"]) -> Float[Array, "*k n action"]:
         return self.acts(obs.reshape(-1, obs.shape[-1])).reshape(*obs.shape[:-1], -1)

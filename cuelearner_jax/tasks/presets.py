@@ -59,10 +59,7 @@ def _replace(start: Any, values: dict[str, Any]) -> Any:
 def quickstart(
     config: Any, space: Space, num_envs: int, episodes: int, layers: tuple[int, ...], **lanes: Any
 ) -> Preset:
-    """Return a preset of minutes for an environment of another library, with so many `episodes` an evaluation.
-
-    `lanes`: fields of the preset.
-    """
+    """Return a preset of minutes for another library's environment; `episodes`: of an evaluation, `lanes`: fields."""
     start = read("other", config, space)["presets"][QUICKSTART].config
     every = num_envs * -(-1_000 // num_envs)  # the first multiple from 1,000 on
     counts = {"eval_every": every, "eval_envs": episodes, "eval_steps": episodes * config.max_steps}

@@ -244,8 +244,8 @@ def test_critics_alone_see_what_is_privileged():
     env = Dark()
     buffer, (state, obs) = buffer_for(env, True), jax.vmap(env.reset)(jax.random.split(KEY, 16))
     _, step = jax.vmap(env.step)(jax.random.split(KEY, 16), state, BOX.sample(KEY, (16,)))
-    kept = jax.vmap(env.remember)(state, obs)
-    stored = jax.vmap(partial(stored_step, bootstraps=True))(kept, BOX.sample(KEY, (16,)), step)
+    memories = jax.vmap(env.remember)(state, obs)
+    stored = jax.vmap(partial(stored_step, bootstraps=True))(memories, BOX.sample(KEY, (16,)), step)
     of = Memory(env, buffer, buffer.add(buffer.empty(96), jnp.array(0), stored), jnp.array(16), 16, True)
     batch, later = of.batches(KEY, 8, 2, 0.9)
     jax.tree.map(np.testing.assert_array_equal, batch, later)  # no second step was taken

@@ -75,8 +75,7 @@ def fault(request):
 def test_a_function_on_the_host_is_named_with_what_it_did(fault, caplog):
     policy = cl.CallablePolicy(Opaque(moody, on_host=True))
     for call in (lambda: policy(SEEN), lambda: adapted(moody)):
-        error = one_line(call, fault)
-        assert error.__cause__ is (FAULT["now"] if isinstance(FAULT["now"], Exception) else None)
+        assert one_line(call, fault).__cause__ is (FAULT["now"] if isinstance(FAULT["now"], Exception) else None)
     assert not caplog.records  # JAX logs the traceback of a callback that raises
     FAULT["now"] = None
     np.testing.assert_array_equal(policy(SEEN), [[1.0, 0.0]] * 4)  # nothing is left behind

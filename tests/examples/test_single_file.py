@@ -91,8 +91,7 @@ def test_one_update_of_double_dqn():
         params, other = (single_file.MLP((8, 8), 1).init(k, obs[0], action[0]) for k in (key, jax.random.key(1)))
         agent = single_file.Agent(params, other, jnp.array(1))
         drawn = jax.random.randint(jax.random.split(key)[0], (8,), 0, 40)
-        stored = single_file.Transition(obs, action, reward, obs[::-1], goes_on)
-        batch = jax.tree.map(lambda leaf: leaf[drawn], stored)
+        batch = jax.tree.map(lambda leaf: leaf[drawn], single_file.Transition(obs, action, reward, obs[::-1], goes_on))
         after, loss = single_file.update(cfg, agent, batch)
         return (after.params, after.target_params), single_file.value_targets(cfg, agent, batch), loss
 

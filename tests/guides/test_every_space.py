@@ -148,8 +148,7 @@ def test_a_kind_learns_alike_in_any_units(kind, units):
         answer = into(rows.answer) if guide.form.is_action else rows.answer
         rows = rows.replace(obs=zero + unit * rows.obs, action=into(rows.action), answer=answer, base=into(rows.base))
         model = guide.fit(KEY, guide, rows, guide.init(KEY), scalars)
-        acted = guide.act(model, guide, rows.obs, rows.base, jnp.ones(100, bool), scalars).actions
-        return space.log(rows.base, acted)
+        return space.log(rows.base, guide.act(model, guide, rows.obs, rows.base, jnp.ones(100, bool), scalars).actions)
 
     ours = jax.jit(partial(shares, plain, 1.0, 0.0))()
     theirs = jax.jit(partial(shares, *units))()
@@ -161,8 +160,7 @@ def test_a_cue_of_which_nothing_is_said_adds_nothing_to_the_loss():
     """Ranges 2, 4, 2: errors of 0.2 and 0.4 of said entries are 0.1 of the range each; the other one does not count."""
     space = SPACES["3"]
     obs, action = jnp.zeros((2, 2)), jnp.tile(space.spread(1), (2, 1))
-    answer = jnp.array([[1.0, UNSAID, 0.0], [UNSAID, -1.0, UNSAID]])
-    labels = Label(obs, action, answer, jnp.ones(2, bool))
+    labels = Label(obs, action, jnp.array([[1.0, UNSAID, 0.0], [UNSAID, -1.0, UNSAID]]), jnp.ones(2, bool))
     scalars = scalars_of(space)
     guide = Relative(SIZES, Spaces(2, space))
     rows = jax.jit(lambda labels: Guide.examples(guide, labels, scalars))(labels)

@@ -93,8 +93,7 @@ def test_the_loss_of_a_preference_is_the_likelihood_of_bradley_and_terry(monkeyp
     utility = SimpleNamespace(predict=lambda env, params, obs, actions: params * actions[:, :1])
     monkeypatch.setitem(vars(bundle), "network", utility)
     a, b = jnp.tile(jnp.array([-1.0, 0.0]), (3, 1)), jnp.tile(jnp.array([1.0, 0.0]), (3, 1))
-    choices = jnp.array([[1.0], [-1.0], [0.0]])
-    rows = bundle.examples(labels(jnp.concatenate([choices, b], -1), OBS[:3], a), SCALARS)
+    rows = bundle.examples(labels(jnp.concatenate([jnp.array([[1.0], [-1.0], [0.0]]), b], -1), OBS[:3], a), SCALARS)
     losses = bundle.losses(ENV, SCALARS, jnp.array(1.0), rows)
     np.testing.assert_allclose(losses, [0.126928, 2.126928, 1.126928], rtol=1e-5)  # log(1 + e^-2), and 2 and 1 more
     slopes = jax.jacobian(lambda params: bundle.losses(ENV, SCALARS, params, rows))(jnp.array(1.0))
@@ -156,8 +155,8 @@ def test_a_cue_that_one_label_names_is_silent_where_that_label_is_held_out(kind,
     space = Box((-1.0,) * 2, (1.0,) * 2, tuple(Cue(name, both, (), "shares") for name, both in words))
     guide, answer = registry.make(kind, SIZES, SimpleNamespace(actions=space, obs_size=3)), np.tile([1, UNSAID], (5, 1))
     answer[4] = UNSAID, 1  # every fifth label is held out, by kinds that hold any
-    given = labels(jnp.float32(answer), jnp.zeros((5, 3)), jnp.zeros((5, 2)))
-    cues = np.asarray(guide.examples(given, dataclasses.replace(SCALARS, eps_deg=0.1)).cues)
+    rows = labels(jnp.float32(answer), jnp.zeros((5, 3)), jnp.zeros((5, 2)))
+    cues = np.asarray(guide.examples(rows, dataclasses.replace(SCALARS, eps_deg=0.1)).cues)
     assert cues[:4].tolist() == [[True, silent]] * 4
 
 

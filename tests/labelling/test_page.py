@@ -161,6 +161,7 @@ def test_arrows_point_where_actions_do(opened):
     assert keys["left"] > 0.3  # of an arrow that points down the left key moves the tip to the right of the screen
     assert keys["right"] < -0.3
     assert [re.search(rf'class="arrow {name}">.*?<text [^>]*>(.)', down)[1] for name in WAYS] == ["←", "→"]
+    assert "&lt;</text>" in view.arrow(item.sketch, 0.0, "left", key="<")
     made = session.questions
     made.pictures = made.pictures._replace(trails=lambda env, state, actions: [f"<{a[0]:.2f}>" for a in actions])
     trails = made.draw(item._replace(trails=None)).trails

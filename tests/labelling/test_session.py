@@ -198,8 +198,7 @@ def test_a_policy_is_asked_about_within_a_bound(opened):
 
 
 def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
-    first = opened()
-    items = give(first, 8)
+    items = give(opened(), 8)
     file = label_files.read(tmp_path / "labels")
     again = tuple(np.float32(row["action"]) for row in label_files.history(tmp_path / "labels" / JSONL))
     second = opened("second", again=again, again_of="x", who="other")
@@ -229,6 +228,16 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
     narrower = file._replace(labels=file.labels.replace(obs=np.asarray(file.labels.obs)[:, :-1]))
     with pytest.raises(UserError, match="observations differ in size"):
         comparing.merge([file, narrower])
+
+
+def test_on_the_page_a_coached_policy_learns_answers_afresh_and_holds_none_out(opened):
+    learners = [opened(name, kind="dcoach").questions.learner for name in ("one", "other")]
+    rows = lambda way: [(np.ones(ENV.obs_size, np.float32), np.float32([1, 0]), np.float32([way]))] * 10  # noqa: E731
+    for learner, ways in zip(learners, ((1, -1), (-1,)), strict=True):  # one takes its first answers back
+        for way in ways:
+            learner.fit(rows(way))
+    chex.assert_trees_all_equal(*(learner.newest.model for learner in learners))
+    assert learners[0].newest.quality is None
 
 
 def test_a_policy_that_gives_no_actions_is_named_before_a_question_is_asked(opened, tmp_path):

@@ -67,8 +67,7 @@ def main(before: str, after: str, dataset: str) -> None:
     pre2.save_pretrained(again, config_filename="policy_preprocessor.json")
     post2.save_pretrained(again, config_filename="policy_postprocessor.json")
     make_pre_post_processors(PreTrainedConfig.from_pretrained(after), pretrained_path=str(again))
-    told = {"moves": moves, "chunk": moved, "places": phases, "added_ms": 1e3 * added, "steps": names}
-    print(json.dumps(told))
+    print(json.dumps({"moves": moves, "chunk": moved, "places": phases, "added_ms": 1e3 * added, "steps": names}))
 
 
 if __name__ == "__main__":

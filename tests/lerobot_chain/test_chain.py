@@ -72,8 +72,7 @@ def test_a_checkpoint_is_corrected_by_labels_and_evaluated_by_lerobot(tmp_path, 
     assert main(["adapt", "--labels-from", "labels", "--out", "corrected"]) == 0
     export = ["export", "corrected", "--format", "lerobot", "--policy", checkpoint]
     assert main([*export, "--out", "checkpoint"]) == 0
-    played = run(tmp_path, str(HERE / "play.py"), checkpoint, "checkpoint", "data").splitlines()[-1]
-    found = json.loads(played)
+    found = json.loads(run(tmp_path, str(HERE / "play.py"), checkpoint, "checkpoint", "data").splitlines()[-1])
     np.testing.assert_allclose(found["moves"], np.tile(MOVED, (12, 1)), atol=10)
     np.testing.assert_allclose(found["chunk"], np.tile(MOVED, (3, 1)), atol=10)
     assert found["places"] == [0, 1, 2, 3, 4, 0, 1, 0, 1, 2, 3, 4]  # a reset in the middle of a chunk

@@ -116,8 +116,7 @@ GOOD = {"observation": [[0.0, 1.0], [2.0, 3.0]], "action": [[0.5], [0.25]]}
     ],
 )
 def test_what_does_not_fit_is_told(changed, told, tmp_path):
-    columns = {name: values for name, values in {**GOOD, **changed}.items() if values is not None}
-    table(tmp_path / "there", **columns)
+    table(tmp_path / "there", **{name: values for name, values in {**GOOD, **changed}.items() if values is not None})
     with pytest.raises(UserError) as error:
         situations.read(tmp_path / "there")
     assert told in str(error.value)
@@ -159,8 +158,7 @@ class Trap:
 
 def test_nothing_is_unpickled(tmp_path, capsys):
     (tmp_path / "there").mkdir()
-    pickled = np.array([Trap()], object)
-    np.savez(tmp_path / "there/situations.npz", observation=np.zeros((1, 2)), action=pickled)
+    np.savez(tmp_path / "there/situations.npz", observation=np.zeros((1, 2)), action=np.array([Trap()], object))
     with pytest.raises(UserError, match="without Python objects"):
         situations.read(tmp_path / "there")
     (tmp_path / "there/situations.npz").write_bytes(pickle.dumps(Trap()))
