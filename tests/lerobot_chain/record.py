@@ -1,8 +1,8 @@
 """Record a tiny LeRobot dataset: a point walks to a place that the picture shows, in the shapes of PushT.
 
 Run by the Python that has LeRobot: `python record.py FOLDER`. With `python record.py FOLDER MJCF`, the joints of an arm
-walk to a pose, and the picture shows the hand from above; `camera.json` has the projection. Behind both is a still
-scene. With `python record.py FOLDER moved`, the camera has moved: the scene is `MOVED` further right and down.
+walk to a pose, and the picture shows the hand from above; `camera.json` has the projection. Behind both is a plain
+table with a block. With `python record.py FOLDER moved`, the scene is `MOVED` further right and down.
 """
 
 import json
@@ -31,7 +31,8 @@ def main(folder: Path, what: Path | None = None) -> None:
     """Record the episodes."""
     mjcf, (right, down) = (None, MOVED) if what == Path("moved") else (what, (0, 0))
     random, (y, x) = np.random.default_rng(right), np.mgrid[-down : SIDE - down, -right : SIDE - right]
-    behind = np.repeat(np.uint8(40 * (2 + np.sin(x / 9) * np.cos(y / 11) + np.sin((x + y) / 23)))[..., None], 3, 2)
+    table, block = y > 56, (abs(x - 28) < 4) & (abs(y - 72) < 3)
+    behind = np.repeat(np.uint8(90 + 60 * table + 70 * block)[..., None], 3, 2)
     names, low, high = (["x", "y"], [100, 100], [400, 400]) if mjcf is None else (JOINTS, LOW, HIGH)
     data = LeRobotDataset.create("tiny", fps=10, features=features(names), root=folder, use_videos=False)
     hand = hand_of(mjcf, "grip", [], "degrees", names) if mjcf else None
@@ -43,8 +44,8 @@ def main(folder: Path, what: Path | None = None) -> None:
             shown = goal / 512 * SIDE if hand is None else np.array(ABOVE) @ np.append(hand.place(place[None])[0], 1)
             x, y = shown[:2].astype(int)
             picture[y - 4 : y + 4, x - 4 : x + 4] = 255
-            state, wanted = place.astype(np.float32), action.astype(np.float32)
-            data.add_frame({"observation.state": state, "observation.image": picture, "action": wanted, "task": "go"})
+            numbers = {"observation.state": place.astype(np.float32), "action": action.astype(np.float32)}
+            data.add_frame({**numbers, "observation.image": picture, "task": "go"})
             place = action + (random.normal(0, 2, 2) if hand is None else random.normal(0, 0.005, 7) * (HIGH - LOW))
         data.save_episode()
     data.finalize()

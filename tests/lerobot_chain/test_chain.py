@@ -79,7 +79,9 @@ def test_a_checkpoint_is_corrected_by_labels_and_evaluated_by_lerobot(tmp_path, 
     assert found["added_ms"] < 1.0
     run(tmp_path, "lerobot-eval", "--policy.path=checkpoint", "--output_dir=evaluated", *EVALUATE.split())
     assert main([*export[:-1], "checkpoint", "--out", "twice"]) == 2
-    assert "holds a correction already" in capsys.readouterr().err
+    again = ["-m", "lerobot_processor_cuelearner", "situations", "--policy", "checkpoint", *write[2:5], "again"]
+    for said in (capsys.readouterr().err, run(tmp_path, *again, refused=True)):
+        assert "holds a correction already" in said
 
 
 def test_pictures_of_a_camera_that_moved_are_moved_back_without_labels(tmp_path):

@@ -75,7 +75,7 @@ def main() -> None:
         not options.no_effects,
         options.first,
     )
-    cues = "forward,back;left,right;up,down" if hand else "left,right;up,down"
+    cues = "forward,back;left,right;up,down" if hand else "ENTRY=less,more"
     print(f'wrote {count} situations; next: cuelearner label {options.out} --cues "{cues}"')
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -21,6 +22,8 @@ PRE, NORMALIZER = "policy_preprocessor.json", "normalizer_processor"
 STEP = f"{PictureStep.__module__}.{PictureStep.__name__}"
 EPISODES = 50  # of which the first pictures are compared, at most
 LIKE = 0.7  # correlation from which two pictures show the same place
+SAME = 0.97  # the same, of pictures that no move makes more alike
+SEEN = 0.6  # least share of a picture that was seen before too
 MOVED = 0.005  # least move of a corner, as a share of the picture, that is one
 STILL = 0.04  # spread of a pixel among first pictures from which something moves there
 # From coarse to fine: what may change, and the width of the blur as a share of the picture
@@ -32,22 +35,45 @@ def align(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, float, flo
     """Return where places before are after (2, 3), and the correlation of the pictures as they are and moved back.
 
     `before`, `after`: pictures (n, height, width, channels) of 0 to 1. Only what is still in all pictures counts. The
-    picture may be shifted and turned. Where no move makes it more alike, it has not moved.
+    picture may be shifted and turned. Where no move makes it more alike, it has not moved if it is alike as it is; else
+    the second correlation is -1.
     """
     height, width = before.shape[1:3]
     first, second = (np.median(one.mean(-1), 0).astype(np.float32) for one in (before, after))
     still = cv2.erode(255 * (after.mean(-1).std(0) < STILL).astype(np.uint8), np.ones((3, 3), np.uint8))
-    own, likeness = np.eye(2, 3, dtype=np.float32), float(cv2.computeECC(first, second, still))
-    try:
-        for motion, blur in STAGES:
-            size = max(3, round(blur * width) | 1)
-            likely, own = cv2.findTransformECC(first, second, own, motion, UNTIL, still, size)
-    except cv2.error:  # it did not converge
-        likely = -1.0
-    if likely <= likeness:
-        return np.eye(2, 3), likeness, likeness
+    likeness = float(cv2.computeECC(first, second, still))
+    likely, best = likeness if likeness > SAME else -1.0, np.eye(2, 3)
+    for start, stages in product(_starts(first, second), (STAGES, STAGES[1:])):
+        own = start.copy()
+        try:
+            for motion, blur in stages:
+                _, own = cv2.findTransformECC(first, second, own, motion, UNTIL, still, _size(blur, width))
+        except cv2.error:  # it did not converge
+            continue
+        back = (own, (width, height))
+        seen = cv2.warpAffine(still, *back, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+        if seen.sum() < SEEN * still.sum():
+            continue
+        moved = cv2.warpAffine(second, *back, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        if (alike := float(cv2.computeECC(first, moved, seen))) > max(likely, likeness):
+            likely, best = alike, own
     even = np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
-    return (even @ np.vstack([own, [0, 0, 1]]) @ np.linalg.inv(even))[:2], likeness, likely
+    return (even @ np.vstack([best, [0, 0, 1]]) @ np.linalg.inv(even))[:2], likeness, likely
+
+
+def _starts(first: np.ndarray, second: np.ndarray) -> list[np.ndarray]:
+    """Return moves (2, 3) from which to search: none, and the shift by phase correlation, sharp and blurred."""
+    height, width = first.shape
+    window, shifts = cv2.createHanningWindow((width, height), cv2.CV_32F), [(0.0, 0.0)]
+    for blur in (0.0, STAGES[1][1]):
+        size = (_size(blur, width),) * 2
+        pair = [cv2.GaussianBlur(one, size, 0) if blur else one for one in (first, second)]
+        shifts.append(cv2.phaseCorrelate(*(one - one.mean() for one in pair), window)[0])
+    return [np.float32([[1, 0, right], [0, 1, down]]) for right, down in shifts]
+
+
+def _size(blur: float, width: int) -> int:
+    return max(3, round(blur * width) | 1)
 
 
 def first_pictures(data: LeRobotDataset, camera: str) -> np.ndarray:

@@ -8,7 +8,7 @@ from itertools import zip_longest
 from pathlib import Path
 
 STAKES = (0.1, 0.2, 0.35, 0.5, 0.7, 0.9)  # of the test's bets, as shares of its capital
-DECIDED = 20.0  # capital that decides: wrong once in 20 times at most, however often one looks
+DECIDED = 20.0  # capital that decides: each verdict is wrong once in 20 times at most, however often one looks
 
 
 def judge(before: Path, after: Path) -> str:

@@ -165,7 +165,7 @@ def _columns(
         raise SystemExit(f"--joints names {len(names)} joints, but an action has {len(entries)} entries")
     if joints and (strange := [name for name in names if name and name not in path]):
         raise SystemExit(f"{strange[0]} of --joints does not move {site}: its joints are {', '.join(path)}")
-    column = {name: names.index(name) for name in path if name in names}
+    column = {name: names.index(name) for name in path if name and name in names}
     if not column or (not joints and len(column) < len(path)):
         raise SystemExit(
             f"{site} of {mjcf} is moved by {', '.join(path) or 'no joint'}, and the action's entries are "

@@ -111,6 +111,8 @@ def _load(checkpoint: str, data: LeRobotDataset) -> tuple[Any, Any, Any, Any]:
     pre, post = make_pre_post_processors(config, pretrained_path=checkpoint, preprocessor_overrides=overrides)
     if any(isinstance(step, RelativeActionsProcessorStep) and step.enabled for step in pre.steps):
         raise SystemExit(f"{checkpoint} has relative actions: give a policy of absolute actions")
+    if any(isinstance(step, PlaceStep) for step in post.steps):
+        raise SystemExit(f"{checkpoint} holds a correction already: give the checkpoint that it was made from")
     return policy, config, pre, post
 
 

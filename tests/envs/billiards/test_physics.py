@@ -69,8 +69,7 @@ def totals(motion, radius):
     """Momentum (count, 2), angular momentum about the origin and energy of discs of mass 1."""
     x, y, ux, uy, rim = (np.asarray(v, float) for v in motion[:5])
     momentum = np.stack([ux.sum(-1), uy.sum(-1)], -1)
-    angular = (x * uy - y * ux + 0.5 * radius * rim).sum(-1)
-    return momentum, angular, (0.5 * (ux**2 + uy**2) + 0.25 * rim**2).sum(-1)
+    return momentum, (x * uy - y * ux + 0.5 * radius * rim).sum(-1), (0.5 * (ux**2 + uy**2) + 0.25 * rim**2).sum(-1)
 
 
 @pytest.mark.parametrize(("friction", "restitution"), [(0.0, 1.0), (0.25, 1.0), (0.25, 0.8), (50.0, 1.0)])
