@@ -261,8 +261,7 @@ def spaces_of(env: Any) -> Spaces:
 
 def _classes(structure: Any) -> tuple[Any, ...]:
     data = structure.node_data()
-    inner = (kind for child in structure.children() for kind in _classes(child))
-    return () if data is None else (data[0], *inner)
+    return () if data is None else (data[0], *(kind for child in structure.children() for kind in _classes(child)))
 
 
 @lru_cache(maxsize=64)

@@ -237,8 +237,7 @@ def stored(state, lane, steps):
 def greedy_actions(q, params, obs, directions=AGENT.directions):
     """The argmax of one lane's values over the agent's directions, for observations (n, 2)."""
     options = evenly_spaced(directions)
-    values = jax.vmap(lambda one: q(params, one, options)[:, 0])(jnp.asarray(obs))
-    return np.asarray(options[jnp.argmax(values, -1)])
+    return np.asarray(options[jnp.argmax(jax.vmap(lambda one: q(params, one, options)[:, 0])(jnp.asarray(obs)), -1)])
 
 
 def label_set(obs, action, answer, valid):

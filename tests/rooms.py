@@ -65,5 +65,4 @@ def to_segments(points, starts, ends):
 
 def distance(points, boxes, circles):
     """From each point to the nearest solid; 0 inside one."""
-    each = [to_box(points, box) for box in boxes] + [to_circle(points, circle) for circle in circles]
-    return np.min(each, axis=0)
+    return np.min([to_box(points, box) for box in boxes] + [to_circle(points, circle) for circle in circles], axis=0)

@@ -107,10 +107,9 @@ def test_the_share_of_known_sums(own, guided, most, lead, expected):
 
 
 def test_the_share_is_twice_the_chance_that_guidance_is_better():
-    known = sums((40, 20), (40, 16))
     # Variances of one episode 0.25 * 40 / 39 and 0.24 * 40 / 39, pooled 0.245 * 40 / 39 at least.
     chance = 0.5 * (1 + math.erf(-0.1 / math.sqrt((0.25 + 0.245) / 39) / math.sqrt(2)))
-    assert float(pace.guided_share(known, HALF)) == pytest.approx(0.5 * 2 * chance, rel=1e-4)
+    assert float(pace.guided_share(sums((40, 20), (40, 16)), HALF)) == pytest.approx(0.5 * 2 * chance, rel=1e-4)
 
 
 def test_few_episodes_that_went_alike_are_not_believed_for_certain():

@@ -268,8 +268,7 @@ def test_a_plain_environment_between_acting_and_learning_gives_the_compiled_loop
     def drawn(step):  # the contexts that the environment of JAX draws
         return jax.vmap(ENV.reset)(jax.random.split(lane.keys(clock.replace(step=step), state).step, 4))[1]
 
-    later = jax.jit(jax.vmap(drawn))(4 * jnp.arange(STRETCH))
-    contexts = np.concatenate([np.asarray(state.agent.obs)[None], later])
+    contexts = np.concatenate([np.asarray(state.agent.obs)[None], jax.jit(jax.vmap(drawn))(4 * jnp.arange(STRETCH))])
     act, absorb, learn = jax.jit(lane.act), jax.jit(lane.absorb), jax.jit(lane.learn)
     plain = PlainWindow(contexts)
     for _ in range(STRETCH):

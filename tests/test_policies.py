@@ -61,8 +61,7 @@ class Aiming:
 def test_actions_near_aims_are_near_each_of_them_and_anywhere_where_there_is_none():
     turns = np.degrees(directions.difference(OBS, act(NearAims(Aiming(), 0.1))))
     here = np.asarray(OBS[:, 1] >= 0)
-    beside = np.abs(np.abs(turns[here]) - 90.0)
-    assert 1.0 < beside.max() <= np.degrees(0.1) + 1e-3
+    assert 1.0 < np.abs(np.abs(turns[here]) - 90.0).max() <= np.degrees(0.1) + 1e-3
     assert {*np.sign(turns[here])} == {-1.0, 1.0}
     assert np.abs(np.abs(turns[~here]) - 90.0).max() > 30.0
 

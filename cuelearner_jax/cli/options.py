@@ -131,7 +131,7 @@ def look_ahead(arguments: list[str]) -> argparse.Namespace:
     """
     parser = _Ahead(add_help=False, allow_abbrev=False)
     parser.add_argument("--env", "--task")
-    for name in (*ONE, "again", "task.actions"):
+    for name in (*ONE, "again", "task.actions", "task.arguments"):
         parser.add_argument(f"--{name}")
     for name, kind in {"guidance": str, "task.low": float, "task.high": float}.items():
         parser.add_argument(f"--{name}", nargs="*", type=kind)

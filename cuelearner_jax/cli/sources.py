@@ -29,7 +29,7 @@ def task_of(ahead: Namespace) -> Task:
     task = _task_by_option(ahead)
     if task is not None and ahead.words:
         raise UserError(f"the task is named twice, {ahead.words[0]!r} and {ahead.env!r}: name it once")
-    return _with_teacher(task or registry.resolve(ahead.words[0]), ahead.teacher)
+    return _with_teacher(task or _resolved(ahead.words[0], ahead), ahead.teacher)
 
 
 def recorded_or_task(ahead: Namespace) -> Task:
@@ -97,7 +97,7 @@ def source_of(ahead: Namespace, is_policy: bool = False) -> PolicySource:
                 f"{word!r} is no run or policy folder, no task ({', '.join(registry.names())}) "
                 f"and no shipped agent ({', '.join(shipped.names())})"
             )
-    task = task or registry.resolve(str(word))
+    task = task or _resolved(str(word), ahead)
     if base is not None:
         raise UserError("--base names the code in a policy folder: give that folder, or leave it out")
     _, preset = preset_of(task, ahead.preset)
@@ -148,7 +148,13 @@ def _task_by_option(ahead: Namespace) -> Task | None:
     is_outside = plugins.REFERENCE.fullmatch(word) and word.partition(":")[0] not in registry.FAMILIES
     if is_outside and not isinstance(plugins.load(word, object, "an environment"), Task):
         word = f"gymnasium:{word}"
-    return registry.resolve(word)
+    return _resolved(word, ahead)
+
+
+def _resolved(word: str, ahead: Namespace) -> Task:
+    """Return the task of a name. The layout of Gymnasium's environments may depend on --task.arguments."""
+    text = getattr(ahead, "task.arguments") if word.startswith("gymnasium:") else None
+    return registry.resolve(word) if text is None else registry.resolve(word, arguments=text)
 
 
 def _recording_task(subject: str, path: str | None) -> Task:

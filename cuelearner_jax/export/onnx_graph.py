@@ -111,8 +111,7 @@ class _Writer:
         self, operands: list[str], results: list[str], carried: list[str], kinds: Any, test: Any, body: Any
     ) -> None:
         """Convert a loop: ONNX reads the condition at the end of a pass, this graph at its beginning."""
-        first = self.nodes(test["ops"], dict(zip(carried, operands, strict=True)), f"_t{next(self._numbers)}")
-        self._nodes += first
+        self._nodes += self.nodes(test["ops"], dict(zip(carried, operands, strict=True)), f"_t{next(self._numbers)}")
         condition = self.names[test["outputs"][0]]
         mark = f"_b{next(self._numbers)}"
         inside = [name + mark for name in carried]

@@ -109,8 +109,7 @@ def direction_at(key: PRNGKeyArray, h: Float[Array, " cues"], angle: Array | flo
     noise = jnp.where(spoken, jax.random.normal(key, h.shape), 0.0)
     across = noise - jnp.sum(noise * h) / jnp.maximum(jnp.sum(h * h), 1.0) * h
     size = _size(across)
-    aside = jnp.cos(angle) * h + jnp.sin(angle) * _size(h) / size * across
-    return jnp.where(size > 1e-3, aside, h)
+    return jnp.where(size > 1e-3, jnp.cos(angle) * h + jnp.sin(angle) * _size(h) / size * across, h)
 
 
 def _size(vector: Float[Array, " cues"]) -> Float[Array, ""]:
@@ -223,5 +222,4 @@ class ClicShown(Clic):
         space = self.spaces.actions
         eps = space.from_unit(scalars.eps_deg)
         away = jax.vmap(lambda action: _size(space.log(row.answer, action) / eps))(actions)
-        radius = RADIUS * _size(space.log(row.answer, row.action) / eps)
-        return SHARPNESS * log_nearer(radius, away, SOFTNESS / 2)
+        return SHARPNESS * log_nearer(RADIUS * _size(space.log(row.answer, row.action) / eps), away, SOFTNESS / 2)

@@ -225,8 +225,7 @@ def _room(sketch: Sketch, angle: float) -> float:
     (x, y), (left, top, width, height) = sketch.foot, sketch.box
     away_x, away_y = (one - other for one, other in zip(_point(sketch, angle, 1.0), sketch.foot, strict=True))
     across = (left + width - x if away_x > 0 else x - left) / max(abs(away_x), 1e-9)
-    down = (top + height - y if away_y > 0 else y - top) / max(abs(away_y), 1e-9)
-    return min(across, down)
+    return min(across, (top + height - y if away_y > 0 else y - top) / max(abs(away_y), 1e-9))
 
 
 def _ends(sketch: Sketch, angle: float, longer: float = 1.0, beyond: float = 0.0) -> tuple[float, float]:

@@ -152,8 +152,7 @@ def jumps(space: Space, whole: Float[Array, "k n action"], eps: Number) -> Bool[
     size = len(whole) // 2
     near, far = space.log(whole[:1], whole[1 : 1 + size]), space.log(whole[:1], whole[1 + size :])
     largest = jnp.fmax(jnp.abs(near), jnp.abs(far)) / (SCALE * eps)
-    bent = jnp.abs(near + far) > 0.5 * jnp.abs(near - far)
-    return ((largest > JUMP) & bent | ~jnp.isfinite(largest)).any(-1).T
+    return ((largest > JUMP) & (jnp.abs(near + far) > 0.5 * jnp.abs(near - far)) | ~jnp.isfinite(largest)).any(-1).T
 
 
 def sides(frame: ObservationFrame, change: Change) -> Float[Array, "k unknowns"]:

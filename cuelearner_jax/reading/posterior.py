@@ -107,8 +107,7 @@ def habits(hyper: Hyper, eps: Float[Array, ""] | float) -> Habits:
 def lengths(hyper: Hyper) -> Float[Array, " z"]:
     """Return the length scale of each input of the process."""
     size = len(hyper.lengths)
-    observed = jnp.arange(size) < size - hyper.actions
-    return LENGTH * size**0.5 * jnp.exp(hyper.lengths + observed * hyper.length)
+    return LENGTH * size**0.5 * jnp.exp(hyper.lengths + (jnp.arange(size) < size - hyper.actions) * hyper.length)
 
 
 @jax.jit
@@ -117,8 +116,7 @@ def correlation(
 ) -> Float[Array, "n m"]:
     """Return the correlation of the process at two sets of inputs."""
     one, other = one / length[None], other / length[None]
-    square = (one**2).sum(-1)[:, None] + (other**2).sum(-1)[None] - 2 * one @ other.T
-    return jnp.exp(-0.5 * jnp.maximum(square, 0.0))
+    return jnp.exp(-0.5 * jnp.maximum((one**2).sum(-1)[:, None] + (other**2).sum(-1)[None] - 2 * one @ other.T, 0.0))
 
 
 def amplitudes(hyper: Hyper) -> Float[Array, " cues"]:

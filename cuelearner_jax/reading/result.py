@@ -69,7 +69,7 @@ class Result(NamedTuple):
             lines.append(f"beyond that, corrections depend on the situation: {self.depends:.3g} typically{near}")
         if self.wrong > 0.1:
             lines.append(f"{self.wrong:.0%} of the answers seem to be about something else")
-        return [*lines, *(f"{words}, and none says where to stop" for words in self.open_ended)]
+        return [*lines, *(f"{words}: none says where to stop, so intervals may be wrong" for words in self.open_ended)]
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values, without the policy."""

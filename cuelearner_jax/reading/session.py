@@ -172,8 +172,7 @@ class Reading:
 
     def act(self, obs: Float[Array, "n obs"]) -> Float[Array, "n action"]:
         """Return actions of the policy as corrected so far."""
-        own = self._acts(obs)
-        return own if self.fit is None or self._reader is None else self._reader.act(self.fit, obs)
+        return self._acts(obs) if self.fit is None or self._reader is None else self._reader.act(self.fit, obs)
 
 
 def acts_of(policy: Any, everywhere: bool = True) -> linear.Acts:

@@ -122,7 +122,7 @@ def report(
     lines = [f"# {markdown(title)}", "", *(f"![{name.replace('_', ' ')}]({name}.png)\n" for name in figures)]
     lines += [*tables.summary_lines(contents.rows), "", NOTE, *(section(efficiency) if efficiency else [])]
     lines += aggregates.section(over, request.level) if over else []
-    missing = contents.missing or ["nothing: all runs are complete"]
+    missing = contents.missing or ["nothing: all runs that have begun are complete"]
     lines += ["", "## Missing", "", *(f"- {markdown(line)}" for line in missing)]
     lines += ["", "## Where the numbers come from", "", *origins(contents.every, command), ""]
     out.mkdir(parents=True, exist_ok=True)

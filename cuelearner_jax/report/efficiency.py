@@ -145,7 +145,7 @@ def _row(own: Sampled, unguided: Sampled | None) -> Row:
     """Return a variant's row of `efficiency.csv`; ratios and differences are to the unguided agents'."""
     variant = own.variant
     row: Row = {**identity(variant), "seeds": len(variant.seeds)}
-    intervals = {"guide": () if variant.guide is None else statistics.interval(variant.guide), "mean": variant.mean}
+    intervals = {"guide": () if variant.guide is None else statistics.interval(variant.guide)[:1], "mean": variant.mean}
     for name, of in intervals.items():
         ends = zip(("", "_lower", "_upper"), of, strict=False)
         row |= {name + end: float(value) for end, value in ends if np.isfinite(value)}

@@ -54,7 +54,8 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
         row |= {"best_step": steps[best], "best": estimate[best]}
         row |= dict.fromkeys((*REACHES, *APART, *IMPROVES), "")
         if unguided is not None and variant is not unguided:
-            row |= _steps_to(variant, sign, sign * unguided.curve.estimate[-1])
+            shared = unguided.curve.estimate[unguided.curve.steps <= max(unguided.curve.steps[0], steps[-1])]
+            row |= _steps_to(variant, sign, sign * shared[-1])
             row |= _against(variant, unguided, sign)
         rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
     return rows

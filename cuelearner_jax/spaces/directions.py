@@ -175,8 +175,7 @@ def expected_values(values: Float[Array, " count"], spread: Float[Array, ""] | f
     `spread`: standard deviation of the error [rad].
     """
     turn = _turns(values.shape[0])
-    around = jnp.minimum(turn, 2 * math.pi - turn)
-    kernel = jax.nn.softmax(-0.5 * jnp.square(around / jnp.maximum(spread, 1e-6)))
+    kernel = jax.nn.softmax(-0.5 * jnp.square(jnp.minimum(turn, 2 * math.pi - turn) / jnp.maximum(spread, 1e-6)))
     return jnp.fft.irfft(jnp.fft.rfft(values) * jnp.fft.rfft(kernel), n=values.shape[0])
 
 

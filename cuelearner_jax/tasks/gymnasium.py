@@ -112,17 +112,20 @@ def make_environment(factory: Callable[..., Any] | None, config: GymnasiumConfig
     if not (name := config.environment):
         raise UserError(f"task.environment is empty: name the task {FAMILY}:ENVIRONMENT, as {FAMILY}:FetchReach-v4")
     check_part(config, "task")
-    try:
-        dict(**json.loads(config.arguments))
-    except (ValueError, TypeError):
-        advice = "give arguments by name as JSON, '{\"size\": 3}'"
-        raise UserError(f"task.arguments is {format_value(config.arguments)}: {advice}") from None
+    _arguments(config.arguments)
     if factory is None and ":" in name:  # the configuration is a file's
         factory = partial(_refuse, name)
     observation = config.observation
     size = sum(quantity.size for quantity in observation)
     source = Source(name, config.arguments, config.max_steps, config.processes, size, factory)
     return GymnasiumTask(source, observation, config.space, config.succeeds)
+
+
+def _arguments(text: str) -> dict[str, Any]:
+    try:
+        return dict(**json.loads(text))
+    except (ValueError, TypeError):
+        raise UserError(f"task.arguments is {text!r}: give arguments by name as JSON, '{{\"size\": 3}}'") from None
 
 
 def _refuse(name: str, **arguments: Any) -> Any:
@@ -146,17 +149,17 @@ GYMNASIUM = Task(
 )
 
 
-def task_of(name: str) -> Task:
+def task_of(name: str, arguments: str = "{}") -> Task:
     """Return the task of an environment: an id of Gymnasium's registry, module:id, or package.module:NAME.
 
-    The module is imported, so never give a name from a file. Raises UserError if the environment is not available.
+    `arguments`: in JSON. The module is imported, so never give a name from a file. Raises UserError where none is.
     """
     if plugins.REFERENCE.fullmatch(name):
-        return task_from(plugins.load(name, object, "an environment"), called=name)
+        return task_from(plugins.load(name, object, "an environment"), _arguments(arguments), called=name)
     module, _, own = name.rpartition(":")
     if module:  # Gymnasium's own way to name an id that a package registers
         plugins.load(f"{module}:__name__", str, "a module that registers environments")
-    return task_from(own)
+    return task_from(own, _arguments(arguments))
 
 
 def task_from(
@@ -181,8 +184,10 @@ def task_from(
     if isinstance(source, str):
         fetch, max_steps = fetch_layout.layout_of(source), max_steps or registry_spec(source).max_episode_steps
     elif callable(source):
-        factory, code = source, getattr(source, "func", source)
-        name = called or f"{getattr(code, '__module__', '')}:{getattr(code, '__qualname__', type(code).__name__)}"
+        if isinstance(source, partial) and not source.args:  # whose arguments a file would lose
+            source, arguments = source.func, {**source.keywords, **(arguments or {})}
+        factory = source
+        name = called or f"{getattr(source, '__module__', '')}:{getattr(source, '__qualname__', type(source).__name__)}"
     else:
         advice = "give an id of Gymnasium's registry, or a class or function that gives environments"
         raise UserError(f"env is {format_value(source)}: {advice}")

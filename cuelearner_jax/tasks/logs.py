@@ -165,8 +165,7 @@ class Recorded(PolicyNode):
         """Return the recorded actions (n, action)."""
         env = self.env
         nearest = lambda one: jnp.argmin(jnp.square(env.rows - one[None]).sum(-1))  # noqa: E731
-        rows = jax.lax.map(nearest, obs) if states is None else states.row
-        return env.actions.retract(env.recorded[rows])
+        return env.actions.retract(env.recorded[jax.lax.map(nearest, obs) if states is None else states.row])
 
 
 def task_of(

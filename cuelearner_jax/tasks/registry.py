@@ -68,16 +68,16 @@ def register(task: Task) -> Task:
     return task
 
 
-def resolve(text: str) -> Task:
+def resolve(text: str, **options: str) -> Task:
     """Return the task that the user names: by its name, as FAMILY:ENVIRONMENT (`FAMILIES`), or as package.module:name.
 
-    A task from outside is registered. The current folder is searched for modules last.
+    `options` are the family's. A task from outside is registered. The current folder is searched for modules last.
     """
     if ":" not in text:
         return find(text)
     family, _, environment = text.partition(":")
     if family in FAMILIES:
-        return dataclasses.replace(resolve_name(FAMILIES[family])(environment), command_name=text)
+        return dataclasses.replace(resolve_name(FAMILIES[family])(environment, **options), command_name=text)
     task = dataclasses.replace(_loaded(text), origin=text)
     installed = _installed().get(task.name)
     return find(task.name) if installed and installed.value == text else register(task)

@@ -146,9 +146,8 @@ def memory(factor=1.0, shift=0.0):
     numbers = jnp.arange(16.0)[:, None].repeat(2, 1)
     step = step.replace(aftermath=step.aftermath * factor + shift)
     stored = jax.vmap(partial(stored_step, bootstraps=True))(obs * factor + shift, numbers, step)
-    rows = buffer.add(buffer.empty(96), jnp.array(0), stored)
     counts = count_guided(jnp.zeros((96, 1), jnp.int32), jnp.array(0), jnp.asarray(GUIDED))
-    return Memory(ENV, buffer, rows, jnp.array(16), 16, True, counts)
+    return Memory(ENV, buffer, buffer.add(buffer.empty(96), jnp.array(0), stored), jnp.array(16), 16, True, counts)
 
 
 @pytest.mark.parametrize(("share", "count"), [(0.0, 0), (0.25, 2), (0.5, 4), (1.0, 8)])

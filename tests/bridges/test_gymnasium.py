@@ -1,5 +1,7 @@
 """Gymnasium's environments as pure functions of seed and actions."""
 
+from functools import partial
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -181,6 +183,10 @@ def test_nested_observations_are_named_and_flattened_in_the_order_of_their_space
     _, steps = walk(here, np.eye(3), state)
     assert rows(steps, "reward").tolist() == [5, 6, 7]
     np.testing.assert_array_equal(rows(steps, "final_obs")[:, -3:], np.eye(3))
+
+
+def test_files_keep_the_arguments_of_a_partial():
+    assert world(partial(Adder, start=2.0)).source.arguments == '{"start": 2.0}'
 
 
 def test_beams_have_the_angle_between_them():

@@ -53,6 +53,11 @@ def test_a_run_is_opened_without_its_environment_and_played_where_its_code_is_na
     assert "success" in capsys.readouterr().out
 
 
+def test_the_layout_is_that_of_the_given_arguments():
+    larger = look_ahead(["gymnasium:FrozenLake-v1", "--task.arguments", '{"map_name": "8x8"}'])
+    assert source_of(larger).config.task.slice_sizes == (64,)
+
+
 def test_a_file_may_not_have_an_id_import_code(run, refused, tmp_path):
     for name in ("os:system", "gymnasium_worlds:Reach-v0"):
         folder = tmp_path / name.replace(":", "-")

@@ -72,8 +72,7 @@ def place(tmp_path, monkeypatch):
 
     table = tmp_path / "situations/situations.parquet"
     columns = pq.read_table(table).to_pydict()
-    names = (f"action.{name}" for name in recorded.ENTRIES)
-    columns |= dict(zip(names, acted(POLICY, observations).T, strict=True))
+    columns |= dict(zip((f"action.{name}" for name in recorded.ENTRIES), acted(POLICY, observations).T, strict=True))
     pq.write_table(pa.table(columns), table)
     return POLICY
 

@@ -128,19 +128,17 @@ def told(goal, eps):
 
     def residual(action):
         error = directions.difference(action, goal)
-        h = jnp.where(jnp.abs(error) <= eps / 2, 0.0, jnp.sign(error))
-        return directions.rotate(action, h * eps) - action
+        return directions.rotate(action, jnp.where(jnp.abs(error) <= eps / 2, 0.0, jnp.sign(error)) * eps) - action
 
     return residual
 
 
 def test_under_vmap_each_lane_has_its_own_number_of_passes():
-    goal = directions.from_angle(jnp.zeros(()))
     first = directions.from_angle(jnp.array([[47.0], [3.0]]) * DEG)
 
     def one(start):
         active = jnp.ones(1, bool)
-        residual = told(goal, 10.0 * DEG)
+        residual = told(directions.from_angle(jnp.zeros(())), 10.0 * DEG)
         return refine(residual, start, active, space=DIRECTIONS, tau=0.1 * DEG, tau_max=math.pi, k_max=50)
 
     assert jax.vmap(one)(first).passes.tolist() == [[6], [1]]

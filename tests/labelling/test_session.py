@@ -56,8 +56,7 @@ def test_the_first_round_is_that_of_a_simulated_teacher(opened, tmp_path):
     for name in ("obs", "action", "answer"):
         np.testing.assert_allclose(getattr(file.labels, name), getattr(after.labels, name)[:10], atol=1e-6)
     # The same labels and the same step of the same stream, though the fit after the first has another number there.
-    told = guide.replace(labels=after.labels)
-    inputs = guidance, ENV, probes.SCALARS, told, keys_of(0).session, jnp.asarray(1)
+    inputs = guidance, ENV, probes.SCALARS, guide.replace(labels=after.labels), keys_of(0).session, jnp.asarray(1)
     chex.assert_trees_all_close(status.newest.model, jax.jit(asking.fit, static_argnums=0)(*inputs).model, atol=1e-4)
     assert (status.newest.labels, status.newest.number, status.newest.quality.count) == (10, 1, 2)
 

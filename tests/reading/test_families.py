@@ -103,10 +103,9 @@ def test_an_environment_declares_what_can_have_changed():
 
 @pytest.mark.parametrize(("space", "policy"), [(DIRECTIONS, aims), (BOX, grips)])
 def test_without_a_change_the_policy_stays_what_it_was(space, policy):
-    family = declared_distortions(Yard(space))
     obs = drawn(jax.random.key(0), 8)
     base = policy_of(jax.jit(policy)).replace(actions=space)
-    corrected = unread(base, space, family, obs.shape[1])
+    corrected = unread(base, space, declared_distortions(Yard(space)), obs.shape[1])
     np.testing.assert_array_equal(corrected.act(jax.random.key(0), None, obs), base.act(jax.random.key(0), None, obs))
 
 

@@ -10,6 +10,7 @@ import pytest
 from cuelearner_jax.cli import main
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report.efficiency import Question, cell, efficiency_of
+from cuelearner_jax.report.tables import summary
 from cuelearner_jax.report.variants import Variant
 from cuelearner_jax.storage import formats, results
 from cuelearner_jax.storage.table import TableWriter
@@ -47,14 +48,21 @@ def test_known_curves_give_known_steps_ratios_and_areas():
     assert known(steered, "steps_to_level") == pytest.approx([30.0] * 4)
     assert known(steered, "steps_ratio") == pytest.approx([0.5] * 4)
     assert (plain["reached"], steered["reached"], "steps_ratio" in plain) == (1.0, 1.0, False)
-    for name, value in (("mean", 0.75), ("mean_difference", 0.25), ("mean_ratio", 1.5), ("guide", 0.1)):
+    for name, value in (("mean", 0.75), ("mean_difference", 0.25), ("mean_ratio", 1.5)):
         assert [steered[name + end] for end in ("", "_lower", "_upper")] == pytest.approx([value] * 3)
+    assert steered["guide"] == pytest.approx(0.1)
+    assert "guide_lower" not in steered  # its episodes are not kept
     shared = np.arange(5)[:, None] / 10  # by equal seeds, which are drawn together
     pair = [variant("none", 0, ramp(1.0) + shared), variant("relative", 100, ramp(1.0) + shared + 0.2)]
     row = efficiency_of(pair, Question(level=0.9)).tables["efficiency"][1]
     assert [row[f"mean_difference{end}"] for end in ("_lower", "_upper")] == pytest.approx([0.2] * 2)
     negative = [same("none", 0, -0.2), same("relative", 100, -0.1)]
     assert "mean_ratio" not in efficiency_of(negative, Question(level=0.1)).tables["efficiency"][1]
+
+
+def test_a_shorter_curve_is_held_against_what_unguided_agents_had_by_then():
+    early = Variant("relative", 100, np.arange(5), STEPS[:6], np.array([ramp(2.0)[:6]] * 5))
+    assert summary([same("none", 0, 1.0), early])[1]["reaches_unguided_final"] == 25
 
 
 def test_the_level_is_the_unguided_agents_at_a_step():

@@ -95,9 +95,8 @@ def test_habit_settles_exact_ties_by_the_smaller_turn_from_x(shift):
 
 
 def test_expected_value_is_that_of_a_gaussian_aim():
-    rng = np.random.default_rng(2)
     count, spread, habit = 60, 0.3, 0.25
-    values = rng.uniform(0, 1, count)
+    values = np.random.default_rng(2).uniform(0, 1, count)
     turn = 2 * np.pi * np.arange(count) / count
     apart = np.abs(turn[:, None] - turn[None])
     kernel = np.exp(-0.5 * (np.minimum(apart, 2 * np.pi - apart) / spread) ** 2)

@@ -83,10 +83,9 @@ def test_pictures_alone_are_read_as_proposed_actions_and_interventions_left_out(
 
 
 def test_proposed_actions_are_part_of_what_is_observed(tmp_path):
-    bounds = json.dumps({"low": [-1.0], "high": [2.0]})
     columns = GOOD | {"phase": [0.0, 0.5], "text": ["pick", ""]}
     (tmp_path / "there").mkdir()
-    stored = pa.table(columns).replace_schema_metadata({"cuelearner": bounds})
+    stored = pa.table(columns).replace_schema_metadata({"cuelearner": json.dumps({"low": [-1.0], "high": [2.0]})})
     pq.write_table(stored, tmp_path / "there/situations.parquet")
     found = situations.read(tmp_path / "there")
     np.testing.assert_array_equal(found.observations, [[0.0, 1.0, 0.0, 0.5], [2.0, 3.0, 0.5, 0.25]])

@@ -40,5 +40,4 @@ def test_aims_are_ways_with_room_and_the_goal_comes_first():
     possible = np.asarray(aims.open)
     assert np.asarray(aims.possible).all()
     assert not possible[behind].any()
-    free = jax.vmap(free_ways)(jax.vmap(points_of)(obs), aims.actions)
-    assert np.asarray(free[:, 0])[possible].min() > ROOM[0]
+    assert np.asarray(jax.vmap(free_ways)(jax.vmap(points_of)(obs), aims.actions)[:, 0])[possible].min() > ROOM[0]

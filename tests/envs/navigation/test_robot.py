@@ -29,10 +29,9 @@ def test_a_step_is_what_a_general_integrator_finds():
     velocity = speed[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)
     pose = np.concatenate([rng.uniform(-5, 5, (20, 2)), rng.uniform(-np.pi, np.pi, (20, 1))], -1)
     angle = rng.uniform(-np.pi, np.pi, 20)
-    robot = Robot(speed=0.8, lag=0.15)
     direction = np.stack([np.cos(angle), np.sin(angle)], -1)
     own = (jnp.asarray(rows, jnp.float32) for rows in (pose, velocity, direction))
-    poses, velocities = step_many(robot, *own, 0.3)
+    poses, velocities = step_many(Robot(speed=0.8, lag=0.15), *own, 0.3)
     for number in range(20):
         heading = pose[number, 2] + angle[number]  # held in the world's frame from the beginning of the step
         wanted = 0.8 * np.array([math.cos(heading), math.sin(heading)])

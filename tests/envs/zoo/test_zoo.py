@@ -76,8 +76,7 @@ def test_answers_say_where_the_right_action_lies_and_teachers_err_as_they_are_to
     _, worlds, states = situations()
     world, state = jax.tree.map(lambda leaf: leaf[1], (worlds, states))
     right, half, eps = zoo.right(world, state), world.robot.half, 0.1
-    action = right + 2 * half * jnp.array([-0.2, 0.3, 0.04])
-    answer = partial(zoo.answer, KEY, world, state, action, eps)
+    answer = partial(zoo.answer, KEY, world, state, right + 2 * half * jnp.array([-0.2, 0.3, 0.04]), eps)
     np.testing.assert_array_equal(answer(), [1, -1, 0])
     np.testing.assert_array_equal(answer(wrong=1.0), [-1, 1, 0])
     np.testing.assert_array_equal(answer(one_cue=True), [UNSAID, -1, UNSAID])
