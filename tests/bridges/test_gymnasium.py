@@ -186,7 +186,7 @@ def test_nested_observations_are_named_and_flattened_in_the_order_of_their_space
 
 
 def test_files_keep_the_arguments_of_a_partial():
-    assert world(partial(Adder, start=2.0)).source.arguments == '{"start": 2.0}'
+    assert world(partial(Adder, start=2.0)).env.source.arguments == '{"start": 2.0}'
 
 
 def test_beams_have_the_angle_between_them():
