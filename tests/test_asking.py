@@ -61,7 +61,7 @@ def asked_one_by_one(guide, number, base, scalars, env=ENV, teacher=EXPERT):
         keys = asking.question_keys(LANE_KEY, position)
         action = question(env, scalars, base, guide, keys)
         answer, answered = said(keys.answer, env, teacher, guide.env, guide.obs, action, scalars)
-        guide = proceed(env, record(guide, position, action, *(np.asarray(answer), bool(answered))), action, keys)
+        guide = proceed(env, record(guide, position, action, np.asarray(answer), bool(answered)), action, keys)
     return fit(env, scalars, guide, LANE_KEY, jnp.asarray(number))
 
 

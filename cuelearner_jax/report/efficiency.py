@@ -145,8 +145,8 @@ def _row(own: Sampled, unguided: Sampled | None) -> Row:
     """Return a variant's row of `efficiency.csv`; ratios and differences are to the unguided agents'."""
     variant = own.variant
     row: Row = {**identity(variant), "seeds": len(variant.seeds)}
-    intervals = {"guide": () if variant.guide is None else statistics.interval(variant.guide)[:1], "mean": variant.mean}
-    for name, of in intervals.items():
+    guide = () if variant.guide is None else (statistics.interquartile_mean(variant.guide),)  # its episodes: not kept
+    for name, of in (("guide", guide), ("mean", variant.mean)):
         ends = zip(("", "_lower", "_upper"), of, strict=False)
         row |= {name + end: float(value) for end, value in ends if np.isfinite(value)}
     row |= _columns("steps_to_level", own.steps, own) | {"reached": float(np.isfinite(own.steps.upper[1:]).mean())}

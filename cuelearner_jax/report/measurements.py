@@ -70,7 +70,7 @@ def differences(rows: Sequence[Measured], others: Sequence[Measured]) -> list[Di
         alike = others if len(others) == 1 else [other for other in others if variant(other) == variant(row)]
         if len(alike) != 1:
             variants, own = "; ".join(map(variant, others)), variant(row) or "without labels"
-            raise UserError(f"--compare has {len(others)} variants ({variants}), but not {own}: compare alike variants")
+            raise UserError(f"--compare has {len(others)} variants ({variants}), but not {own}: measure one of both")
         both = row, alike[0]
         shared = [name for name in row.metrics if name in both[1].metrics]
         finite = [name for name in shared if all(np.isfinite(one.metrics[name]).all() for one in both)]

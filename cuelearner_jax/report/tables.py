@@ -35,8 +35,8 @@ def code(text: object) -> str:
 def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[Row]:
     """Return one row for each variant, with unrounded numbers; the columns are those of `summary.csv`.
 
-    `reaches_unguided_final` is the interquartile mean over seeds of the step from which a seed stays as good as the
-    final value without guidance; "never" if too many seeds end below that for a mean. `above_unguided` and
+    `reaches_unguided_final` is the interquartile mean over seeds of the step from which a seed stays as good as no
+    guidance at the variant's last step; "never" if too many seeds end below that for a mean. `above_unguided` and
     `below_unguided` are the stretches of steps at which the interval of the difference excludes zero. `improvement` is
     the probability that a seed's mean over the curve is better than that of an unguided seed. Equal seeds are drawn
     together. With several runs, a variant is compared with the unguided variant of `unguided_of`.

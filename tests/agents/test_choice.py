@@ -72,10 +72,10 @@ def test_the_quick_choice_of_a_network_is_the_full_one(coarse):
 
 def test_a_first_look_in_bfloat16_gives_up_hardly_any_value():
     obs, params = jax.random.normal(jax.random.key(1), (64, 5)), agent()
-    found = chosen(dataclasses.replace(FULL, coarse_directions=60, coarse_dtype="bfloat16", peaks=4), params, obs)
+    choices = chosen(dataclasses.replace(FULL, coarse_directions=60, coarse_dtype="bfloat16", peaks=4), params, obs)
     q = as_function(q_network(LAYERS))
     values = jax.vmap(lambda seen: q(params, seen, evenly_spaced(360))[:, 0])(obs)
-    taken = jax.vmap(lambda seen, action: q(params, seen, action)[0])(obs, found)
+    taken = jax.vmap(lambda seen, action: q(params, seen, action)[0])(obs, choices)
     given_up = (values.max(1) - taken) / (values.max(1) - values.mean(1))
     assert float(given_up.max()) < 0.02
     assert float(jnp.mean(given_up == 0)) > 0.9

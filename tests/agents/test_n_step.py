@@ -142,9 +142,9 @@ def test_the_target_lies_between_that_of_one_step_and_that_of_many_by_the_weight
     # Value 8 to the target network, which is what counts, and -3 to the online one. One step: 1 + 0.5 * 8 and a
     # termination with 2; three steps: 3 + 0.5 * 0.25 * 8 and 3 with a termination.
     near, far = batch([1.0, 2.0], [1.0, 0.0]), batch([3.0, 3.0], [0.25, 0.0])
-    known = (None, dataclasses.replace(OPTIONS, n_step_weight=weight), HALF, constant(-3.0), constant(8.0))
-    np.testing.assert_allclose(AGENT.targets(*known, [near, far]), expected, rtol=1e-6)
-    np.testing.assert_allclose(AGENT.targets(*known, [near]), [5.0, 2.0], rtol=1e-6)
+    inputs = (None, dataclasses.replace(OPTIONS, n_step_weight=weight), HALF, constant(-3.0), constant(8.0))
+    np.testing.assert_allclose(AGENT.targets(*inputs, [near, far]), expected, rtol=1e-6)
+    np.testing.assert_allclose(AGENT.targets(*inputs, [near]), [5.0, 2.0], rtol=1e-6)
 
 
 # The whole loop.

@@ -53,9 +53,9 @@ def test_the_density_integrates_to_one_and_draws_follow_it():
 
 
 def test_the_density_is_finite_where_tanh_is_one():
-    found = sac.squashed_log_density(jnp.zeros((1, 2)), jnp.zeros((1, 2)), jnp.array([[60.0, -60.0]]))
+    log_p = sac.squashed_log_density(jnp.zeros((1, 2)), jnp.zeros((1, 2)), jnp.array([[60.0, -60.0]]))
     # log(1 - tanh(u)^2) is log 4 - 2 |u| far out.
-    assert float(found[0]) == pytest.approx(2 * (120 - math.log(4) - 0.5 * math.log(2 * math.pi)), rel=1e-5)
+    assert float(log_p[0]) == pytest.approx(2 * (120 - math.log(4) - 0.5 * math.log(2 * math.pi)), rel=1e-5)
 
 
 def test_actions_lie_in_the_box_and_their_unit_coordinates_between_its_bounds():

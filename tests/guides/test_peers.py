@@ -48,29 +48,29 @@ def made(kind, **sizes):
 def test_a_half_space_along_one_cue_ends_halfway_to_the_better_action():
     """|x| - |x - 1| is -1, 0, 0.5, 1 at x = -2, 1/2, 3/4, 2: twice that, for the softness is 1/2."""
     x = jnp.array([[-2.0], [0.5], [0.75], [2.0]])
-    found = log_desired(x, jnp.array([1.0]), jnp.ones((4, 1)), gamma=1.0)
-    np.testing.assert_allclose(found, log_sigmoid([-2.0, 0.0, 1.0, 2.0]), atol=1e-5)
-    np.testing.assert_allclose(log_desired(-x, jnp.array([-1.0]), -jnp.ones((4, 1)), 1.0), found, atol=1e-6)
+    log_p = log_desired(x, jnp.array([1.0]), jnp.ones((4, 1)), gamma=1.0)
+    np.testing.assert_allclose(log_p, log_sigmoid([-2.0, 0.0, 1.0, 2.0]), atol=1e-5)
+    np.testing.assert_allclose(log_desired(-x, jnp.array([-1.0]), -jnp.ones((4, 1)), 1.0), log_p, atol=1e-6)
     beside = jnp.concatenate([x, jnp.ones((4, 1))], 1)  # of several cues one is named
-    np.testing.assert_allclose(log_desired(beside, jnp.array([1.0, UNSAID]), jnp.ones((4, 2)), 1.0), found, atol=1e-6)
+    np.testing.assert_allclose(log_desired(beside, jnp.array([1.0, UNSAID]), jnp.ones((4, 2)), 1.0), log_p, atol=1e-6)
     near = log_desired(x, jnp.array([1.0]), jnp.ones((4, 1)), gamma=0.1)  # the edge lies at 0.05
     np.testing.assert_allclose(near, log_sigmoid([-0.2, 0.2, 0.2, 0.2]), atol=1e-5)
 
 
 def test_implicit_pairs_narrow_the_half_space():
     """h = (1, 0), u = (0, 1), gamma 1/2: the worse action is (1/2, 1/2). At (0, 2) and (1, 0) by Pythagoras."""
-    found = log_desired(jnp.array([[0.0, 2.0], [1.0, 0.0]]), jnp.array([1.0, 0.0]), jnp.array([[0.0, 1.0]]), gamma=0.5)
+    log_p = log_desired(jnp.array([[0.0, 2.0], [1.0, 0.0]]), jnp.array([1.0, 0.0]), jnp.array([[0.0, 1.0]]), gamma=0.5)
     pair = log_sigmoid([2 * (np.sqrt(2.5) - np.sqrt(5.0)), 2 * (np.sqrt(0.5) - 0.0)])
     moving = (pair + 0.3 * log_sigmoid([2 * (2.0 - np.sqrt(4.25)), 2 * (1.0 - 0.5)])) / 1.3
     right = [(log_sigmoid(2 * (1.0 - 2.0)) + log_sigmoid(2 * (3.0 - 2.0))) / 2, log_sigmoid(2.0)]
-    np.testing.assert_allclose(found, (moving + np.array(right)) / 2, atol=1e-5)  # the second cue is already right
+    np.testing.assert_allclose(log_p, (moving + np.array(right)) / 2, atol=1e-5)  # the second cue is already right
 
 
 def test_already_right_holds_the_action_between_its_neighbours():
-    found = np.asarray(log_desired(jnp.array([[-1.0], [0.0], [0.4], [1.0]]), jnp.zeros(1), jnp.zeros((4, 1)), 0.1))
-    assert found.argmax() == 1
-    assert found[0] == pytest.approx(found[3], abs=1e-6)
-    np.testing.assert_allclose(found[3], (log_sigmoid(-2.0) + log_sigmoid(2.0)) / 2, atol=1e-5)
+    log_p = np.asarray(log_desired(jnp.array([[-1.0], [0.0], [0.4], [1.0]]), jnp.zeros(1), jnp.zeros((4, 1)), 0.1))
+    assert log_p.argmax() == 1
+    assert log_p[0] == pytest.approx(log_p[3], abs=1e-6)
+    np.testing.assert_allclose(log_p[3], (log_sigmoid(-2.0) + log_sigmoid(2.0)) / 2, atol=1e-5)
 
 
 def test_a_cue_of_which_nothing_was_said_is_no_evidence():
@@ -98,8 +98,8 @@ def test_what_was_shown_has_a_ball_whose_radius_is_a_share_of_the_way_there():
     shown = exp(MIDDLE, jnp.array([2 * eps, 0.0, 0.0]))
     row = contrast("clic_shown", MIDDLE, shown)
     away = np.array([[0.0], [1.0], [2.0]]) * np.array([0.0, eps, 0.0])
-    found = jax.jit(guide.membership)(KEY, row, exp(jnp.tile(shown, (3, 1)), jnp.asarray(away, jnp.float32)), SCALARS)
-    np.testing.assert_allclose(found, clic.SHARPNESS * log_sigmoid(np.array([1.0, 0.0, -1.0]) / 0.25), rtol=1e-4)
+    log_p = jax.jit(guide.membership)(KEY, row, exp(jnp.tile(shown, (3, 1)), jnp.asarray(away, jnp.float32)), SCALARS)
+    np.testing.assert_allclose(log_p, clic.SHARPNESS * log_sigmoid(np.array([1.0, 0.0, -1.0]) / 0.25), rtol=1e-4)
 
 
 # CLIC's loss and its policy.

@@ -72,11 +72,11 @@ def test_a_checkpoint_is_corrected_by_labels_and_evaluated_by_lerobot(tmp_path, 
     assert main(["adapt", "--labels-from", "labels", "--out", "corrected"]) == 0
     export = ["export", "corrected", "--format", "lerobot", "--policy", checkpoint]
     assert main([*export, "--out", "checkpoint"]) == 0
-    found = json.loads(run(tmp_path, str(HERE / "play.py"), checkpoint, "checkpoint", "data").splitlines()[-1])
-    np.testing.assert_allclose(found["moves"], np.tile(MOVED, (12, 1)), atol=10)
-    np.testing.assert_allclose(found["chunk"], np.tile(MOVED, (3, 1)), atol=10)
-    assert found["places"] == [0, 1, 2, 3, 4, 0, 1, 0, 1, 2, 3, 4]  # a reset in the middle of a chunk
-    assert found["added_ms"] < 1.0
+    plays = json.loads(run(tmp_path, str(HERE / "play.py"), checkpoint, "checkpoint", "data").splitlines()[-1])
+    np.testing.assert_allclose(plays["moves"], np.tile(MOVED, (12, 1)), atol=10)
+    np.testing.assert_allclose(plays["chunk"], np.tile(MOVED, (3, 1)), atol=10)
+    assert plays["places"] == [0, 1, 2, 3, 4, 0, 1, 0, 1, 2, 3, 4]  # a reset in the middle of a chunk
+    assert plays["added_ms"] < 1.0
     run(tmp_path, "lerobot-eval", "--policy.path=checkpoint", "--output_dir=evaluated", *EVALUATE.split())
     assert main([*export[:-1], "checkpoint", "--out", "twice"]) == 2
     again = ["-m", "lerobot_processor_cuelearner", "situations", "--policy", "checkpoint", *write[2:5], "again"]
@@ -114,8 +114,8 @@ def test_the_hand_of_an_arm_is_corrected_where_people_think(tmp_path, monkeypatc
     assert all('class="arrow motion"' in trail for trail in trails)
     assert main(["adapt", "--labels-from", "labels", "--out", "corrected"]) == 0
     assert main(["export", "corrected", "--format", "lerobot", "--policy", checkpoint, "--out", "checkpoint"]) == 0
-    found = json.loads(run(tmp_path, str(HERE / "play.py"), checkpoint, "checkpoint", "data").splitlines()[-1])
-    print(f"added time an action: {found['added_ms']:.2f} ms")
-    for moves in (found["moves"], found["chunk"]):
+    plays = json.loads(run(tmp_path, str(HERE / "play.py"), checkpoint, "checkpoint", "data").splitlines()[-1])
+    print(f"added time an action: {plays['added_ms']:.2f} ms")
+    for moves in (plays["moves"], plays["chunk"]):
         np.testing.assert_allclose(np.array(moves)[:, :3], np.tile(HAND_MOVED, (len(moves), 1)), atol=0.006)
         assert np.array(moves)[:, 3].tolist() == [0.0] * len(moves)

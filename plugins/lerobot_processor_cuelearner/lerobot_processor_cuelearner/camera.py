@@ -23,7 +23,7 @@ STEP = f"{PictureStep.__module__}.{PictureStep.__name__}"
 EPISODES = 50  # of which the first pictures are compared, at most
 LIKE = 0.7  # correlation from which two pictures show the same place
 SAME = 0.97  # the same, of pictures that no move makes more alike
-SEEN = 0.6  # least share of a picture that was seen before too
+OVERLAP = 0.6  # least share of what is still in a picture that the other one shows too
 MOVED = 0.005  # least move of a corner, as a share of the picture, that is one
 STILL = 0.04  # spread of a pixel among first pictures from which something moves there
 # From coarse to fine: what may change, and the width of the blur as a share of the picture
@@ -50,12 +50,12 @@ def align(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, float, flo
                 _, own = cv2.findTransformECC(first, second, own, motion, UNTIL, still, _size(blur, width))
         except cv2.error:  # it did not converge
             continue
-        back = (own, (width, height))
-        seen = cv2.warpAffine(still, *back, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
-        if seen.sum() < SEEN * still.sum():
+        to_first = (own, (width, height))
+        overlap = cv2.warpAffine(still, *to_first, flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP)
+        if overlap.sum() < OVERLAP * still.sum():
             continue
-        moved = cv2.warpAffine(second, *back, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-        if (alike := float(cv2.computeECC(first, moved, seen))) > max(likely, likeness):
+        back = cv2.warpAffine(second, *to_first, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        if (alike := float(cv2.computeECC(first, back, overlap))) > max(likely, likeness):
             likely, best = alike, own
     even = np.array([[2 / width, 0, 1 / width - 1], [0, 2 / height, 1 / height - 1], [0, 0, 1]])
     return (even @ np.vstack([best, [0, 0, 1]]) @ np.linalg.inv(even))[:2], likeness, likely
@@ -73,6 +73,7 @@ def _starts(first: np.ndarray, second: np.ndarray) -> list[np.ndarray]:
 
 
 def _size(blur: float, width: int) -> int:
+    """Return the size of a blur's window [pixels], which is odd, from its share of the width [pixels]."""
     return max(3, round(blur * width) | 1)
 
 
