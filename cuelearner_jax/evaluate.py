@@ -133,32 +133,21 @@ def evaluate_policy(
     return _rolled(policy, env, key, num_envs, steps).means
 
 
-RESAMPLES = 2_000
-DRAWN_TOGETHER = 1 << 18  # values, at most: small arrays take no loop in Python, and large ones little memory
+def mean_interval(values: Float[np.ndarray, "*lanes n"], is_share: bool = False) -> Float[np.ndarray, "3 *lanes"]:
+    """Return the mean of independent values and its 95% interval by Student's t (NaN for a single value).
 
-
-def mean_interval(values: Float[np.ndarray, "*lanes n"], resamples: int = RESAMPLES) -> Float[np.ndarray, "3 *lanes"]:
-    """Return the mean of independent values and its 95% percentile bootstrap interval (NaN for a single value).
-
-    The same values give the same interval. For the difference of two policies, pass each environment's difference.
+    Of a share, whose values are all 0 or 1, the interval is that of Wilson's score, which holds near 0 and 1 too. For
+    the difference of two policies, pass each environment's difference.
     """
     values = np.asarray(values, float)
     count, mean = values.shape[-1], values.mean(-1)
-    if count == 1:
-        return np.stack([mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan)])
-    random = np.random.default_rng(0)
-    together = max(1, DRAWN_TOGETHER // max(1, values.size))
-    means = []
-    for first in range(0, resamples, together):
-        rows = random.integers(0, count, (min(together, resamples - first), count))
-        means.append(np.moveaxis(values[..., rows].mean(-1), -1, 0))
-    return np.stack([mean, *np.quantile(np.concatenate(means), [0.025, 0.975], axis=0)])
-
-
-def extreme_share(value: float, count: int) -> tuple[float, float, float]:
-    """Return a share of none (0) or all (1) of so many, with its 95% interval by Jeffreys' prior."""
-    certain = float(scipy.special.betaincinv(count + 0.5, 0.5, 0.05))
-    return (1.0, certain, 1.0) if value else (0.0, 0.0, 1 - certain)
+    if is_share and np.isin(values, (0, 1)).all():
+        score = scipy.special.ndtri(0.975) ** 2 / count
+        middle, half = mean + score / 2, np.sqrt(score * (mean * (1 - mean) + score / 4))
+        return np.stack([mean, *np.clip([(middle - half) / (1 + score), (middle + half) / (1 + score)], 0, 1)])
+    error = values.std(-1, ddof=1) / count**0.5 if count > 1 else np.full(mean.shape, np.nan)
+    half = scipy.special.stdtrit(count - 1, 0.975) * error
+    return np.stack([mean, mean - half, mean + half])
 
 
 GROUPS = 20  # most groups of episodes whose means an evaluation keeps

@@ -83,14 +83,3 @@ def test_lanes_in_stretches_are_bitwise_those_in_one(monkeypatch, at_once):
     assert told[0] == (0, 6 * batches)
     assert told[-1] == (6 * batches, 6 * batches)
     evaluate._on_mesh.clear_cache()  # it has seen other portions than the device's
-
-
-@pytest.mark.parametrize("shape", [(7,), (2, 3, 50), (0, 4)])
-def test_a_bootstrap_interval_is_bitwise_that_of_single_draws(shape, monkeypatch):
-    values = np.random.default_rng(3).normal(size=shape)
-    together = evaluate.mean_interval(values)
-    monkeypatch.setattr(evaluate, "DRAWN_TOGETHER", 1)
-    np.testing.assert_array_equal(together, evaluate.mean_interval(values))
-    random = np.random.default_rng(0)
-    means = np.array([values[..., random.integers(0, shape[-1], shape[-1])].mean(-1) for _ in range(2_000)])
-    np.testing.assert_array_equal(together, [values.mean(-1), *np.quantile(means, [0.025, 0.975], axis=0)])

@@ -26,7 +26,6 @@ from cuelearner_jax.tasks import shipped
 from cuelearner_jax.terminal import console, progress_bars, watched_by
 
 FEWEST = 6  # differences that are all alike and that a two-sided sign test tells from 0
-SHARES = "where all are 0, or all are 1, Jeffreys' interval"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -161,10 +160,10 @@ def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:
     is_alone = all(row.guidance == "-" for row in rows)  # of no folder
     columns = {} if is_alone else {name: cells for name, cells in columns.items() if any(cells)}
     over = {
-        "episodes": f"one policy: mean and bootstrap over {episodes}",
-        "seeds": f"several seeds: interquartile mean and bootstrap over seeds and {episodes}",
+        "episodes": f"one policy: mean over {episodes}, Student's t, of shares Wilson's score",
+        "seeds": f"several seeds: interquartile mean, bootstrap over seeds and {episodes}",
     }
-    caption = "; ".join([*(words for kind, words in over.items() if kind in map(measurements.over, rows)), SHARES])
+    caption = "; ".join(words for kind, words in over.items() if kind in map(measurements.over, rows))
     table = Table(*columns, "metric", "mean", "95% interval", title=title, caption=caption)
     for number, row in enumerate(rows):
         own = [cells[number] for cells in columns.values()]
@@ -183,10 +182,10 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
     over = f"{episodes}, paired" if difference.over == "episodes" else f"seeds and {episodes} (interquartile means)"
     names = zip((title, other), map(measurements.variant, both), strict=True)
     heading = " against ".join(f"{name} ({variant})" if variant and name != "base" else name for name, variant in names)
-    caption = f"mean [95% bootstrap interval]; {SHARES}; of the difference over {over}"
+    caption = f"mean [95% interval]; of the difference over {over}"
     table = Table("metric", "policy", "against", "difference", title=heading, caption=caption)
     for name, less in difference.metrics.items():
-        table.add_row(name, *(str(measurements.spread(row, name)) for row in both), f"{less:+}")
+        table.add_row(name, *(f"{measurements.spread(row, name)}" for row in both), f"{less:+}")
     return table
 
 

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
-import numpy as np
 import tyro
 
 from cuelearner_jax import config as configuration
@@ -222,11 +221,9 @@ def _second(plan: SessionPlan, options: LabelOptions, path: Path) -> SessionPlan
             raise UserError(f"{path} asked in a world with another {name} ({before!r}, not {value!r}): give the same")
     place = label_files.found_in(path)
     assert place is not None  # the file was read above
-    actions = {row["item"]: np.asarray(row["action"], np.float32) for row in label_files.history(place)}
-    again = tuple(actions[number] for number in sorted(actions))
+    again = tuple(row for _, row in sorted({row["item"]: row for row in label_files.history(place)}.items()))
     base = plan.base._replace(name=f"{file.session['base']} {file.session['base_digest']}".strip())
-    count, digest = min(plan.labels, len(again)), label_files.digest(path)
-    seed = int(file.session["seed"])
+    count, seed, digest = min(plan.labels, len(again)), int(file.session["seed"]), label_files.digest(path)
     return dataclasses.replace(plan, base=base, seed=seed, labels=count, again=again, again_of=digest)
 
 

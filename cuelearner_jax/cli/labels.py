@@ -67,7 +67,8 @@ class Merge:
         if self.out is None or self.out.suffix != ".parquet":
             raise UserError("merge needs --out: give it a name that ends in .parquet")
         files = [comparing.read_checked(path) for path in self.files]
-        file, left_out = comparing.merge(files)
+        name = str(files[0].task.get("name"))
+        file, left_out = comparing.merge(files, registry.find(name).labels_hold if name in registry.names() else ())
         sources = [f"{path.name} {label_files.digest(path)}" for path in self.files]
         label_files.write_file(self.out, file, merged_from=sources)
         twice = f"; {left_out} duplicates of an earlier file's labels were left out" if left_out else ""

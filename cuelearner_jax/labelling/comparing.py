@@ -65,15 +65,18 @@ def with_teacher(
 
 
 def between(one: LabelFile, other: LabelFile) -> AnswerAgreement:
-    """Return how well two files agree on the questions both answered (equal observation and action)."""
+    """Return how well two files agree: each answer with each of the other file's to an equal observation and action."""
     form = form_of(one)
     if form is None or (one.answers, one.space, one.eps) != (other.answers, other.space, other.eps):
         kinds = [
             file.answers + ("" if file.eps is None else f" ({file.eps:g} {file.space.unit})") for file in (one, other)
         ]
         raise UserError(f"the files hold {' and '.join(kinds)} answers: give two of one form")
-    mine, theirs = (dict(zip(_questions(file), np.asarray(file.labels.answer), strict=True)) for file in (one, other))
-    pairs = [(mine[question], theirs[question]) for question in mine if question in theirs]
+    mine, others = (zip(_questions(file), np.asarray(file.labels.answer), strict=True) for file in (one, other))
+    theirs: dict[bytes, list[np.ndarray]] = {}
+    for question, answer in others:
+        theirs.setdefault(question, []).append(answer)
+    pairs = [(answer, their) for question, answer in mine for their in theirs.get(question, ())]
     both = np.array(pairs, np.float32).reshape(-1, 2, form.width(one.space))
     return agreement(form, one.space, both[:, 0], both[:, 1])
 
@@ -85,22 +88,21 @@ def _questions(file: LabelFile) -> list[bytes]:
     return [row.tobytes() for row in np.concatenate([labels.obs, labels.action, second], -1, dtype=np.float32)]
 
 
-def merge(files: Iterable[LabelFile]) -> tuple[LabelFile, int]:
+def merge(files: Iterable[LabelFile], labels_hold: Iterable[str] = ()) -> tuple[LabelFile, int]:
     """Concatenate the labels of several files; return the merged file and the number of duplicates left out.
 
     A label is a duplicate if an earlier file has a label of equal observation, action and answer, and of equal person
-    and time where both files record them. Raises UserError if the files differ in task, world, form or strength.
+    and time where both files record them. Raises UserError if task, form, strength or world differ (`labels_hold` may).
     """
     files, earlier, nameless, fresh = list(files), set(), set(), []
     first, everyone = files[0], all(file.people is not None for file in files)
     for file in files:
         if len(np.unique(file.seeds)) > 1:
             raise UserError("a file holds the labels of several seeds: merge files of one seed each")
-        worlds = ({**one.task, "answers": one.answers, "space": one.space, "eps": one.eps} for one in (first, file))
-        apart = {"path": ""} if "digest" in first.task else {}  # a recording, which its digest tells, may lie elsewhere
-        own, other = ({**world, **apart} for world in worlds)
+        own, other = ({**of.task, "answers": of.answers, "space": of.space, "eps": of.eps} for of in (first, file))
+        apart = {"path"} if "digest" in first.task else {}  # a recording, which its digest tells, may lie elsewhere
         for name in own | other:
-            if (before := own.get(name)) != (now := other.get(name)):
+            if name not in {*apart, *labels_hold} and (before := own.get(name)) != (now := other.get(name)):
                 raise UserError(f"the files differ in {name} ({before}, {now}): merge only files that agree in it")
         if file.labels.obs.shape[1] != first.labels.obs.shape[1]:
             raise UserError("the files' observations differ in size: merge files of one world")

@@ -59,7 +59,7 @@ class SessionPlan:
     # largest distance of a question from the base policy's action, in the space's unit; None: no bound
     bound_deg: float | None = None
     robot: str = ""  # the robot's body and its locomotion policy, where not the task's default
-    again: tuple[np.ndarray, ...] = ()  # actions that another session of this seed asked about, to be asked again
+    again: tuple[dict[str, Any], ...] = ()  # rows of another session of this seed, whose questions are asked again
     again_of: str = ""  # digest of that session's file
     family: Family = ()  # reading only: what may have changed
     one_cue: bool = False  # whether one press about one of several cues is the whole answer

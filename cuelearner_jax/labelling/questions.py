@@ -10,9 +10,10 @@ import numpy as np
 from cuelearner_jax import asking, user_code
 from cuelearner_jax.asking import GuideState
 from cuelearner_jax.environment import actions_of
+from cuelearner_jax.errors import UserError
 from cuelearner_jax.labelling import controls
 from cuelearner_jax.labelling.learner import Learner
-from cuelearner_jax.labelling.plan import SessionPlan, keys_of, proceed
+from cuelearner_jax.labelling.plan import SAME, SessionPlan, keys_of, proceed
 from cuelearner_jax.policies import policy_name
 from cuelearner_jax.spaces import DIRECTIONS
 from cuelearner_jax.types import Reel, Sketch
@@ -62,9 +63,13 @@ class Questions:
         return proceed(self.env, item.guide, jnp.asarray(item.action), keys)
 
     def ask(self, number: int, guide: GuideState) -> Item:
-        """Choose the action to ask about in a situation. Raises UserError for a policy without valid actions."""
+        """Choose the action to ask about in a situation. Raises UserError for invalid actions, or another situation."""
         if number < len(self.plan.again):
-            return Item(number, guide, self.plan.again[number])
+            obs, action = (np.asarray(self.plan.again[number][name], np.float32) for name in ("obs", "action"))
+            if obs.shape != guide.obs.shape or not np.allclose(np.asarray(guide.obs), obs, atol=SAME):
+                why = "the environment does not repeat itself, or a version of it or of cuelearner differs"
+                raise UserError(f"question {number + 1} of --again had another situation: {why}: leave out --again")
+            return Item(number, guide, action)
         action = self.learner.question(guide, asking.question_keys(self.keys.session, number))
         user_code.check_actions(np.isfinite(action), policy_name(self.plan.base.policy))
         return Item(number, guide, action)

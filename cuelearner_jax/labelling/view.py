@@ -173,7 +173,8 @@ def _cues(sketch: Sketch, item: Item, space: Space, answers: Sequence[Control]) 
             parts.append(_at_edge(sketch, angle, lane, control))
     for name, action in ((item.pair or {"asked": item.action}) | {"refined": item.refined}).items():
         if action is not None and middle is not None and not item.trails:  # which show where actions lead
-            shares = np.asarray(space.to_unit(space.log(middle, action))) / (space.reach / 2)
+            start = np.where(np.asarray(space.retract(0 * middle)) == 0, 0, middle)  # 0 where a range holds it
+            shares = np.asarray(space.to_unit(space.log(start, action))) / (space.reach / 2)
             parts.append(_from_foot(sketch, ways, shares, name))
     return parts
 
@@ -202,7 +203,7 @@ def _at_edge(sketch: Sketch, angle: float, lane: int, control: Control) -> str:
 def _from_foot(sketch: Sketch, ways: Sequence[Direction | None], shares: np.ndarray, name: str) -> str:
     """Draw an action as an arrow from the foot of a sketch, if it is long enough to be seen.
 
-    `shares` (cues,) is the action's distance from the middle of each cue's range; 1 is the end of the range.
+    `shares` (cues,) is the action's distance from 0, or from the middle of a range without 0; 1 is half of the range.
     """
     x, y = shares @ np.array([way or (0.0, 0.0) for way in ways])
     if (far := math.hypot(x, y)) < LEAST:

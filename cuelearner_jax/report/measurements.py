@@ -10,7 +10,7 @@ import numpy as np
 
 from cuelearner_jax import config
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import extreme_share, group_means, mean_interval
+from cuelearner_jax.evaluate import group_means, mean_interval
 from cuelearner_jax.report.statistics import Interval, interquartile_mean, interval, resampled
 from cuelearner_jax.runs.policy_sources import POLICIES, PolicySource
 from cuelearner_jax.storage.provenance import provenance
@@ -32,15 +32,15 @@ def spread(row: Measured, metric: str) -> Interval | None:
     """Return one policy's mean over episodes, or the interquartile mean over seeds; None if a value is not finite.
 
     The interval of several seeds draws seeds and episodes. Where all episodes succeed, or all fail, resampling has no
-    spread: the interval of a share is then by Jeffreys' prior, from the episodes of one seed, which all seeds share.
+    spread: the interval is then that of the episodes of one seed, which all seeds share.
     """
     if not np.isfinite(row.metrics[metric]).all():
         return None
-    each = row.each[metric][:1] if is_single(row) else row.each[metric]
-    no_shares = ("reward", "return") if "return" in row.metrics else ()
-    if metric not in no_shares and each.min() == each.max() and each.min() in (0, 1) and each.shape[-1] > 1:
-        return Interval(*map(np.asarray, extreme_share(float(each.min()), each.shape[-1])))
-    return Interval(*mean_interval(each[0])) if is_single(row) else interval(row.metrics[metric], group_means(each))
+    each = row.each[metric]
+    is_share = metric not in (("reward", "return") if "return" in row.metrics else ())
+    if is_single(row) or (is_share and each.min() == each.max() and each.min() in (0, 1)):
+        return Interval(*mean_interval(each[0], is_share))
+    return interval(row.metrics[metric], group_means(each))
 
 
 class Difference(NamedTuple):

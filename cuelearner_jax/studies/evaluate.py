@@ -20,7 +20,7 @@ from cuelearner_jax import user_code
 from cuelearner_jax.devices import release_programs
 from cuelearner_jax.environment import actions_of, view_of
 from cuelearner_jax.errors import UserError
-from cuelearner_jax.evaluate import episodes, extreme_share, ignore_progress, mean_interval, part_of, rollout_lanes
+from cuelearner_jax.evaluate import episodes, ignore_progress, mean_interval, part_of, rollout_lanes
 from cuelearner_jax.feedback.answers import relative_feedback
 from cuelearner_jax.guides import registry as guidances
 from cuelearner_jax.policies import Common, lanes_in, policy_name
@@ -84,7 +84,7 @@ def amount(task: Task, request: EvaluateRequest) -> tuple[int, int]:
         if request.steps is not None or request.envs is not None:
             raise UserError("episodes determines environments and steps: leave out steps and envs")
         if longest is None:
-            raise UserError(f"{task.name} counts steps, not episodes: give steps in place of episodes")
+            raise UserError(f"{task.name} counts steps, not episodes: give --steps (in Python steps)")
         envs = request.episodes
     if envs < 1:
         raise UserError(f"{'envs' if request.episodes is None else 'episodes'} is {envs}: give at least 1")
@@ -149,7 +149,7 @@ def run(
 
 
 class Agreement(NamedTuple):
-    """Shares of answers, with 95% intervals over labels: by the bootstrap, of all or none by Jeffreys' prior."""
+    """Shares of answers, with 95% intervals over labels, see `mean_interval`."""
 
     labels: int
     policy: Share  # answers that the policy agrees with
@@ -185,8 +185,8 @@ def agreement(policy: Any, rows: Label, space: Space, eps: float, base: Any = No
         return ((own == answers) & counts).sum(-1) / counts.sum(-1)
 
     def interval(values: Float[np.ndarray, " labels"], is_share: bool = True) -> Share:
-        estimate, low, high = (float(value) for value in mean_interval(values))
-        return extreme_share(estimate, len(values)) if is_share and low == high in (0, 1) else (estimate, low, high)
+        estimate, low, high = (float(value) for value in mean_interval(values, is_share))
+        return estimate, low, high
 
     own, right = agreed(policy), agreed(None)
     if base is None:

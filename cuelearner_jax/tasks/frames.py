@@ -77,34 +77,39 @@ def pictures_of(
 # --- Gymnasium: a spare instance replays an episode's actions --------------------------------------------------------
 
 
-def _replayed(env: Any, seed: Any, actions: Any, first: int) -> list[Picture]:
-    """Return pictures of an episode after its first `first` actions. Raises UserError where there are none."""
-    from cuelearner_jax.bridges.gymnasium.pool import pool_of
+def _replayed(env: Any, seed: Any, place: Any, history: Any, actions: Any) -> list[Picture]:
+    """Return pictures after an episode's `history` and each of the actions. Raises UserError away from `place`."""
+    from cuelearner_jax.bridges.gymnasium.pool import Request, pool_of
 
     source = env.source
     if source.factory is None:
         source = dataclasses.replace(source, arguments=fetch_layout.picture_arguments(source.name, source.arguments))
-    rows = np.asarray(actions, np.float32).reshape(-1, env.actions.size)
-    return pool_of(dataclasses.replace(source, draws=True)).film(int(seed), rows, first)
+    history, actions = (np.asarray(rows, np.float32).reshape(-1, env.actions.size) for rows in (history, actions))
+    request = Request(int(seed), np.asarray(place, np.uint32).tobytes(), history=history)
+    return pool_of(dataclasses.replace(source, draws=True)).film(request, actions)
 
 
 def _drawn_instance(env: Any, state: Any, actions: Any) -> list[Picture]:
-    seed, steps, history = jax.device_get((state.seed, state.steps, state.actions))
-    return _replayed(env, seed, np.concatenate([history[:steps], actions]), int(steps))
+    seed, steps, history, place = jax.device_get((state.seed, state.steps, state.actions, state.place))
+    return _replayed(env, seed, place, history[:steps], actions)
 
 
 def _filmed_episodes(env: Any, states: Sequence[Any], actions: Sequence[Any]) -> list[Picture]:
-    begins = [number for number, (_, steps) in enumerate(states) if steps == 0]
-    episodes = zip(begins, [*begins[1:], len(states)], strict=True)
-    return [frame for first, end in episodes for frame in _replayed(env, states[first][0], actions[first:end], 0)]
+    begins = [number for number, (_, steps, _) in enumerate(states) if steps == 0]
+    frames = []
+    for first, end in zip(begins, [*begins[1:], len(states)], strict=True):
+        seed, _, place = states[end - 1]
+        _replayed(env, seed, place, actions[first : end - 1], ())  # pictures on the way may move it by a rounding
+        frames += _replayed(env, seed, (), (), actions[first:end])
+    return frames
 
 
 GYMNASIUM = pictures_of(
     _drawn_instance,
-    lambda state: (state.seed, state.steps),
+    lambda state: (state.seed, state.steps, state.place),
     _filmed_episodes,
     lambda env: () if env.source.factory else fetch_layout.points_of(env.source.name, env.source.arguments),
-    check=lambda env: _replayed(env, 0, (), 0),
+    check=lambda env: _replayed(env, 0, (), (), ()),
 )
 
 

@@ -145,7 +145,7 @@ GYMNASIUM = Task(
     bodies=(_body(),),
     longest=lambda config: config.max_steps,
     judge_by=lambda config: SUCCESS if config.succeeds else "return",
-    labels_hold=("max_steps", "processes", "succeeds"),  # a label depends on one observation only
+    labels_hold=("max_steps", "processes", "succeeds", "cues", "cue_names"),  # a label is about one observation
 )
 
 
@@ -193,11 +193,6 @@ def task_from(
         raise UserError(f"env is {format_value(source)}: {advice}")
     text = _as_json(dict(arguments or {}))
     actions, slices, limit, succeeds = _tried(Source(name, text, max_steps or 0, 1, factory=factory))
-    if not max_steps and not limit:
-        console.print(
-            f"environment {name} has no limit of steps: an episode that goes on is truncated after {UNLIMITED:,}, or "
-            "after --task.max-steps (in Python max_steps)"
-        )
     slices = _with_names(name, slices, observation or fetch, units or {})
     pairs = cues.split(";") if isinstance(cues, str) else cues
     words = tuple(pair if isinstance(pair, str) else ",".join(pair) for pair in pairs if pair)
@@ -239,14 +234,13 @@ def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
     """
     from gymnasium.spaces import flatten
 
-    one, ended = Running(source.make, source.name, 0), False
+    one, terminated, truncated = Running(source.make, source.name, 0), False, False
     try:
         slices = [Quantity(leaf.name, leaf.size, UNKNOWN_UNIT) for leaf in one.leaves if leaf.size]
         limit, first = _limit(one.env), one.reset(0)
         one.space.seed(0)
-        while not ended and one.steps < min(limit or TRIED, TRIED):
+        while not (terminated or truncated) and one.steps < min(limit or TRIED, TRIED):
             _, _, terminated, truncated, _ = one.step(np.asarray(flatten(one.space, one.space.sample())))
-            ended = terminated or truncated
         if not np.array_equal(first, one.reset(0)):
             raise UserError(
                 f"{one.whose} does not repeat itself: with the same seed, its reset gives another observation after an "
@@ -254,6 +248,11 @@ def _tried(source: Source) -> tuple[Actions, list[Quantity], int, bool]:
             )
         if all(np.array_equal(first, one.reset(seed)) for seed in (1, 2, 3)):
             console.print(f"{one.whose}: all episodes begin alike, whatever their seed; results hold for this start")
+        if not (source.max_steps or limit or truncated):
+            console.print(
+                f"{one.whose} names no limit of steps: an episode that goes on is truncated after {UNLIMITED:,}, or "
+                "after --task.max-steps (in Python max_steps)"
+            )
     finally:
         one.close()
     return one.actions, slices, limit, one.reports_success

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from gymnasium_worlds import Adder, limited
+from gymnasium_worlds import Adder, Forgetful, limited
 from PIL import Image
 
 import cuelearner_jax as cl
@@ -110,6 +110,11 @@ def test_pictures_are_of_the_state_that_is_shown(tmp_path):
     assert len(rewards) == 9
     pictures.question(env, states[2], None, jnp.float32([-0.5]), tmp_path / "question.png")
     assert Image.open(tmp_path / "question.png").size == (48, 16)
+    forgetful = cl.from_gymnasium(Forgetful, max_steps=6, processes=1)
+    with pytest.raises(UserError, match="elsewhere than before, so pictures would show other situations: let it draw"):
+        pictures.sketch(forgetful.env, forgetful.step(KEY, forgetful.reset(KEY)[0], np.float32([0.1]))[0])
+    with pytest.raises(UserError, match="so pictures would show other situations"):
+        pictures.record(forgetful.env, uniform_in(env), KEY, 4)
     (drawn,) = pids(env.replace(source=dataclasses.replace(env.source, draws=True)))
     pool.close_all()
     assert not is_alive(drawn)

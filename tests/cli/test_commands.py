@@ -31,7 +31,7 @@ def test_every_policy_is_evaluated(run_folder, tmp_path, capsys, policy):
     assert "reward" in told
     trained = policy in TRAINED
     assert ("trained steps" in told) == ("bootstrap over seeds and 10 environments" in told) == trained
-    assert ("mean and bootstrap over 10 environments of 2 steps" in told) == (not trained)
+    assert ("mean over 10 environments of 2 steps, Student's t" in told) == (not trained)
     rows = json.loads(out.read_text())["rows"]
     lanes = {("none", 0), ("relative", 10), ("relative", 20)}
     assert {row["intervals"]["over"] for row in rows} == {"seeds" if trained else "episodes"}

@@ -7,6 +7,9 @@ import pytest
 from cuelearner_jax.cli import main
 
 QUICK = ["sweep", "billiards", "--preset", "quickstart"]
+WALK = ["evaluate", "navigation", "--policy", "uniform", "--task.worlds", "8", "--task.max-steps", "20"]
+SHORT = "steps is 1200 for 120 environments, 10 each, but an episode lasts up to 20: give steps 2400"
+WALKS = ["sweep", "navigation", "--preset", "quickstart", "--schedule.eval-envs", "10", "--schedule.eval-steps", "200"]
 
 ARGUMENTS = [
     (["evalute"], "did you mean 'evaluate'"),
@@ -26,6 +29,13 @@ ARGUMENTS = [
     (["evaluate", "billiards", "--compare", "nowhere"], "--compare is 'nowhere': give a run folder, a policy folder"),
     (["evaluate", "billiards", "--compare", "docs/data/navigation_agent"], "not of billiards: give one of billiards"),
     (["evaluate", "billiards", "--steps", "150"], "multiple of envs"),
+    ([*WALK, "--steps", "1200", "--envs", "120"], SHORT),
+    ([*WALK, "--steps", "10000", "--task.max-steps", "200"], "give steps 20000"),
+    ([*WALK, "--episodes", "12", "--envs", "12"], "leave out steps and envs"),
+    ([*WALK, "--episodes", "0"], "episodes is 0: give at least 1"),
+    (["evaluate", "billiards", "--episodes", "3"], "billiards counts steps, not episodes: give --steps"),
+    ([*WALKS, "--task.max-steps", "21"], "an episode lasts up to 21: give --schedule.eval-steps 210"),
+    ([*WALKS, "--task.worlds", "0"], "task.worlds is 0: give a number from 1"),
     (["render", "billiards", "--film", "avi"], "gif or mp4"),
     (["evaluate", "billiards", "--task.table", "one_ball", "--policy", "teacher"], "--task.teacher search"),
     (["report", "--out", "report"], "no folder to report on"),

@@ -13,7 +13,8 @@ from cuelearner_jax.bridges.gymnasium import pool
 from cuelearner_jax.cli import main
 from cuelearner_jax.cli.options import look_ahead
 from cuelearner_jax.cli.sources import source_of
-from cuelearner_jax.storage import results
+from cuelearner_jax.config import to_json
+from cuelearner_jax.storage import label_files, results
 
 REACH = "gymnasium:gymnasium_worlds:reach"
 TINY = [
@@ -100,6 +101,15 @@ def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
     source = source_of(look_ahead(again[1:]))
     assert (source.config.task.slices, source.config.task.processes) == (("hand", "goal"), 1)  # the folder's own
     assert main([*again, "--episodes", "4"]) == 0
+    for steps in (5, 12):  # labels about this world, with words for its cues
+        there, rows = cl.make(world[1], max_steps=steps, cues=("a,b", "c,d", "e,f")), np.zeros((1, steps, 6), "f4")
+        labels = probes.label_set(rows, rows[..., :3], rows[..., :3], np.ones((1, steps), bool))
+        about = {"name": "gymnasium", **to_json(there.config)}, "relative", there.actions, 1 / 36, np.zeros(1)
+        label_files.write(tmp_path / f"{steps}.parquet", *about, labels)
+    files = [str(tmp_path / f"{name}.parquet") for name in (5, 12, "both")]
+    assert main(["labels", "merge", *files[:2], "--out", files[2]]) == 0
+    given = ["--guidance", "relative", "--judge-by", "labels", "--labels-from", files[2], *SMALL]
+    assert main([*command[:4], *given, "--out", str(tmp_path / "given")]) == 0
 
 
 @pytest.mark.parametrize(

@@ -72,6 +72,8 @@ def test_cues_are_arrows_where_their_words_point_with_keys_and_words():
     assert {name[:5] for name in arrows(drawn(box(CUES), one_cue=True))} == {"only-"}
     assert arrows(drawn(box("higher,lower"))) == {"+1": (90, "H", "higher"), "-1": (-90, "L", "lower")}
     assert arrows(drawn(box("right,left")))["+1"][0] == 0  # more may be to the right
+    right = drawn(Box((-0.2, -0.5), (0.6, 0.1), cues_from("right,left;up,down")), np.float32([0.16, -0.01]))
+    assert arrows(right.replace('"arrow asked"', '"said arrow" data-name="0"'))["0"] == (-5,)  # from 0, not the middle
     assert view.by_words(cues_from("left,up")[0]) is None
     assert view.by_words(cues_from("more to the left,less")[0]) == (-1.0, 0.0)
 

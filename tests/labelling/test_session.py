@@ -199,7 +199,9 @@ def test_a_policy_is_asked_about_within_a_bound(opened):
 def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
     items = give(opened(), 8)
     file = label_files.read(tmp_path / "labels")
-    again = tuple(np.float32(row["action"]) for row in label_files.history(tmp_path / "labels" / JSONL))
+    again = tuple(label_files.history(tmp_path / "labels" / JSONL))
+    with pytest.raises(UserError, match="question 2 of --again had another situation: the environment does not repeat"):
+        opened("third", again=(again[0], again[1] | {"obs": again[0]["obs"]}), again_of="x")
     second = opened("second", again=again, again_of="x", who="other")
     for item in items:
         np.testing.assert_array_equal(second.item.guide.obs, item.guide.obs)
@@ -213,6 +215,8 @@ def test_a_second_opinion_is_about_the_same_questions(opened, tmp_path):
     assert theirs.people.who.tolist() == ["other"] * 8
     merged, left_out = comparing.merge([file, theirs])
     assert (merged.people.item.tolist(), left_out) == (list(range(16)), 0)
+    all_pairs = comparing.between(merged, theirs)  # both people's answers with theirs
+    assert (all_pairs.count, all_pairs.value) == (16, (8 + 6 + same) / 16)
     again, left_out = comparing.merge([file, file, merged])
     assert (len(again.seeds), left_out) == (16, 16)
     nobodys = [one._replace(people=None) for one in (file, merged)]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.evaluate import group_means, mean_interval
@@ -20,12 +21,17 @@ def measured(seeds, gain=0.0, labels=0, **other):
     return Measured("relative", labels, 100, np.array(seeds), {"reward": each.mean(-1)}, {"reward": each}, **other)
 
 
-def test_an_interval_of_a_mean_covers_it_in_95_of_100():
-    samples = np.random.default_rng(2).normal(size=(400, 50))
-    mean, lower, upper = mean_interval(samples, resamples=400)
-    np.testing.assert_allclose(mean, samples.mean(-1))
-    assert 0.9 < ((lower <= 0) & (upper >= 0)).mean() < 0.97
+def test_an_interval_of_a_mean_covers_it_in_95_of_100_also_of_few_values():
+    for count in (3, 50):
+        samples = np.random.default_rng(2).normal(size=(4_000, count))
+        mean, lower, upper = mean_interval(samples)
+        np.testing.assert_allclose(mean, samples.mean(-1))
+        assert np.mean((lower <= 0) & (upper >= 0)) == pytest.approx(0.95, abs=0.01)
     assert np.isnan(mean_interval(np.array([0.5]))[1:]).all()
+    for successes in (0, 3, 20):
+        known = scipy.stats.binomtest(successes, 20).proportion_ci(method="wilson")
+        found = mean_interval(np.repeat([1.0, 0.0], [successes, 20 - successes]), is_share=True)
+        assert found == pytest.approx((successes / 20, *known))
 
 
 def test_one_policy_has_an_interval_over_episodes_and_several_over_seeds():
@@ -45,11 +51,11 @@ def test_one_policy_has_an_interval_over_episodes_and_several_over_seeds():
 
 def test_a_share_of_all_episodes_has_an_interval():
     row = measured([1, 2])._replace(metrics={"success": np.ones(2)}, each={"success": np.ones((2, 50))})
-    # Jeffreys, 50 of 50 that both share
-    assert measurements.spread(row, "success") == pytest.approx((1, 0.962, 1), abs=1e-3)
+    # of the 50 of 50 that both share
+    assert measurements.spread(row, "success") == pytest.approx((1, 0.929, 1), abs=1e-3)
     lost = row._replace(metrics={"success": np.zeros(2)}, each={"success": np.zeros((2, 50))})
-    assert measurements.spread(lost, "success") == pytest.approx((0, 0, 0.038), abs=1e-3)
-    assert measurements.spread(row._replace(is_shared=True), "success") == pytest.approx((1, 0.962, 1), abs=1e-3)
+    assert measurements.spread(lost, "success") == pytest.approx((0, 0, 0.071), abs=1e-3)
+    assert measurements.spread(row._replace(is_shared=True), "success") == pytest.approx((1, 0.929, 1), abs=1e-3)
     sums = measured([1])._replace(metrics={"return": np.zeros(1)}, each={"return": np.zeros((1, 50))})  # no share
     assert measurements.spread(sums, "return") == (0, 0, 0)
 

@@ -112,8 +112,8 @@ class Request(NamedTuple):
     """One row of a call."""
 
     seed: int  # seed of the episode
-    place: bytes = b""  # place before the action
-    action: np.ndarray | None = None  # (action,); None: begin the episode
+    place: bytes = b""  # place before the action; empty: unknown
+    action: np.ndarray | None = None  # (action,); None: begin the episode, or draw
     next_seed: int = 0  # seed of the next episode, where this one ends
     history: Any = ()  # (steps, action) that lead to the place
 
@@ -306,26 +306,26 @@ class Instances:
         for action in request.history:
             one.step(action)
         self.replays += len(request.history)
-        if one.place != request.place:
+        if request.place and one.place != request.place:
+            shows = ", so pictures would show other situations" * (request.action is None)
             raise UserError(
                 f"{one.whose} does not repeat itself: with seed {request.seed} and the same {len(request.history)} "
-                "actions it came elsewhere than before: let it draw from its own np_random alone, and reset everything "
-                "in reset(seed=...)"
+                f"actions it came elsewhere than before{shows}: let it draw from its own np_random alone, and reset "
+                "everything in reset(seed=...), or use recorded situations (logs:FOLDER)"
             )
 
-    def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray] | str:
-        """Return pictures of an episode after its first `first` actions, or the words of an error.
+    def film(self, request: Request, actions: np.ndarray) -> list[np.ndarray] | str:
+        """Return a picture of a request's place and one after each of the actions, or the words of an error.
 
         There are fewer pictures where the episode ends before its actions do.
         """
         try:
             one = self.running[0] if self.running else self._new()
-            one.reset(seed)
-            frames = [one.picture()] if first == 0 else []
+            self._replay(one, request)
+            frames = [one.picture()]
             for action in actions:
                 *_, terminated, truncated, _ = one.step(action)
-                if one.steps >= first:
-                    frames.append(one.picture())
+                frames.append(one.picture())
                 if terminated or truncated:
                     break
             return frames

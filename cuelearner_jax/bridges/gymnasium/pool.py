@@ -141,9 +141,9 @@ class Pool:
             raise UserError(fault)
         return answers
 
-    def film(self, seed: int, actions: np.ndarray, first: int) -> list[np.ndarray]:
-        """Return pictures of an episode from step `first` on. Raises UserError if there are none."""
-        return self._call("film", {0: (seed, actions, first)})[0]
+    def film(self, request: Request, actions: np.ndarray) -> list[np.ndarray]:
+        """Return pictures of a place and after each action. Raises UserError if there are none."""
+        return self._call("film", {0: (request, actions)})[0]
 
     def close(self) -> None:
         """End all processes and close all instances."""
