@@ -9,7 +9,7 @@ step that is executed, and these steps are half of every minibatch; with demonst
 2023). `rlpd` fits a policy to as many demonstrations; half of all episodes and of every minibatch are that policy's.
 
 After the pieces, or alone with --report, there is a report of each world (FOLDER/push/report): curves of success, the
-step from which seeds stay at 80%, and the ratio to the steps of the agent alone.
+steps to 80%, and the ratio to the steps of the agent alone.
 """
 
 from __future__ import annotations

@@ -23,8 +23,9 @@ THRESHOLDS = np.linspace(-0.25, 1.25, 61)
 NOTE = (
     "A run's score is its mean over the curve. In each task 0 is the unguided agents' interquartile mean, 1 is {}. All "
     "runs have equal weight. In brackets: 95% bootstrap intervals over seeds and episodes, drawn in each task, with 0 "
-    "and 1 held fixed. The median is that of the tasks' means. The optimality gap is the mean shortfall from 1. The "
-    "probability of improvement over the unguided agents is a mean over tasks."
+    "and 1 held fixed: to tell a kind from the unguided agents, take the probability of improvement (a mean over "
+    "tasks), not an interval that excludes 0. The median is that of the tasks' means, the optimality gap the mean "
+    "shortfall from 1."
 )
 STATISTICS: dict[str, Callable[[list[Scores]], np.ndarray]] = {
     "interquartile mean": lambda tasks: interquartile_mean(np.concatenate(tasks, axis=1), axis=1),

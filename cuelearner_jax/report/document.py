@@ -26,10 +26,11 @@ ORIGINS = {"command": "runs made by", "config_hash": "configuration", "commit": 
 ORIGINS |= {"versions": "versions", "hardware": "hardware"}
 NOTE = (
     "Interquartile means over seeds with their 95% percentile bootstrap intervals in brackets, over seeds and the "
-    "evaluation's episodes; with fewer than 10 seeds such intervals are too narrow. [no spread]: all draws are equal, "
-    "which does not make the value certain; evaluate more episodes. Steps are environment steps of one seed. "
-    "Comparisons draw equal seeds together. Each evaluation is compared by itself, so a short stretch may be chance. "
-    "The probability of improvement is that of a seed's mean over the curve against an unguided seed's."
+    "evaluation's episodes; with few seeds such intervals are too narrow: with 5 they hold the truth in about 90 of "
+    "100 studies, with 3 in 75, with 2 in 50. [no spread]: all draws are equal, which does not make the value certain; "
+    "evaluate more episodes. Steps are environment steps of one seed. Means over the curve are compared with those of "
+    "the unguided agents, equal seeds drawn together; the probability of improvement is that of a seed against an "
+    "unguided seed."
 )
 
 

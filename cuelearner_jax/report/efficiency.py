@@ -1,6 +1,6 @@
 """Label efficiency: steps to a level, and how many labels of one kind equal those of another, with intervals.
 
-The steps to a level are the interquartile mean over seeds of the step from which a seed stays at the level or above.
+The steps to a level are the interquartile mean over seeds of the step at which a seed's nondecreasing fit reaches it.
 A level is held fixed. A curve that ends below the level is right-censored (`Range`): its steps are "more than the
 last", which ratios and intervals carry on as a bound, never as a number. Intervals are those of `Variant.samples`.
 """
@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
 from jaxtyping import Float, Int
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import statistics
-from cuelearner_jax.report.tables import Row, identity, markdown, markdown_table, unguided_of
+from cuelearner_jax.report.tables import RISE, Row, identity, level_of, markdown, markdown_table, unguided_of
 from cuelearner_jax.report.variants import Variant
 
 Samples = Float[np.ndarray, "samples"]  # the estimate, then the draws of its bootstrap
@@ -31,7 +30,8 @@ class Question:
     """Value of the metric to be reached (default: see --level-at). Of several tasks: the value whose normalised score
     is 1 (default: the best variant's mean over the curve)."""
     level_at: int | None = None
-    """Without --level: step of the unguided agents whose value is the level (default: the last one of all curves)."""
+    """Without --level: step of the unguided agents whose value is the level (default: 90% of the way from their first
+    value to the last of all curves)."""
     reference: str | None = None
     """Kind of guidance with whose labels those of others are compared (default: each)."""
 
@@ -133,10 +133,9 @@ def _level(variants: Sequence[Variant], question: Question) -> tuple[float, str]
         return question.level, "given"
     if (unguided := next((variant for variant in variants if variant.guidance == "none"), None)) is None:
         raise UserError("no results of unguided agents, whose level would be the one to reach: give --level")
-    steps = unguided.curve.steps
-    shared = steps[steps <= max(steps[0], unguided.span[1])]
-    at = question.level_at if question.level_at is not None else int(shared[-1])
-    if at not in steps:
+    if (at := question.level_at) is None:
+        return level_of(unguided, unguided.span[1]), f"{RISE:.0%} of the way of {unguided.name} over the curve"
+    if at not in (steps := unguided.curve.steps):
         raise UserError(f"--level-at {at}: {unguided.name} has no such step, but {', '.join(map(str, steps))}")
     return float(unguided.curve.estimate[np.flatnonzero(steps == at)[0]]), f"that of {unguided.name} at step {at:,}"
 
@@ -166,10 +165,8 @@ def _row(own: Sampled, unguided: Sampled | None) -> Row:
 def _equal_area(run: str, asking: dict[str, list[Sampled]], reference: str | None, sign: float) -> list[Row]:
     """Return the labels of one kind that give the mean over the curve of another's (or the reference's) budgets."""
     budgets = {kind: np.array([each.variant.labels for each in own]) for kind, own in asking.items()}
-    fitted = {}  # each sample's nondecreasing least-squares fit (pool adjacent violators)
-    for kind, own in asking.items():
-        samples = sign * np.stack([each.areas for each in own], axis=1)
-        fitted[kind] = np.stack([scipy.optimize.isotonic_regression(row).x for row in samples])
+    areas = {kind: sign * np.stack([each.areas for each in own], axis=1) for kind, own in asking.items()}
+    fitted = {kind: statistics.nondecreasing(samples) for kind, samples in areas.items()}
     rows = []
     for base in asking if reference is None else [kind for kind in asking if kind == reference]:
         for place, labels in enumerate(budgets[base].tolist()):

@@ -18,8 +18,9 @@ from cuelearner_jax.report.statistics import Interval
 from cuelearner_jax.report.variants import Variant
 
 Row = dict[str, str | int | float]  # of a table
-REACHES = ("reaches_unguided_final", "reaches_unguided_final_lower", "reaches_unguided_final_upper")
-APART, IMPROVES = ("above_unguided", "below_unguided"), ("improvement", "improvement_lower", "improvement_upper")
+RISE = 0.9  # of the way from the unguided agents' first value to their last: the level to reach where none is given
+COMPARISONS = ("reaches_unguided", "mean_difference", "improvement")
+REACHES, DIFFERS, IMPROVES = (tuple(name + end for end in ("", "_lower", "_upper")) for name in COMPARISONS)
 
 
 def markdown(text: object) -> str:
@@ -35,11 +36,11 @@ def code(text: object) -> str:
 def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[Row]:
     """Return one row for each variant, with unrounded numbers; the columns are those of `summary.csv`.
 
-    `reaches_unguided_final` is the interquartile mean over seeds of the step from which a seed stays as good as no
-    guidance at the variant's last step; "never" if too many seeds end below that for a mean. `above_unguided` and
-    `below_unguided` are the stretches of steps at which the interval of the difference excludes zero. `improvement` is
-    the probability that a seed's mean over the curve is better than that of an unguided seed. Equal seeds are drawn
-    together. With several runs, a variant is compared with the unguided variant of `unguided_of`.
+    `reaches_unguided` is the interquartile mean over seeds of the step at which a seed is at `level_of` the unguided
+    agents by the variant's last step (`steps_to_level`); "never" if too many seeds end below that for a mean.
+    `mean_difference` is the mean over the curve less the unguided seeds'. `improvement` is the probability that a
+    seed's mean over the curve is better than that of an unguided seed. Equal seeds are drawn together. With several
+    runs, a variant is compared with the unguided variant of `unguided_of`.
     """
     sign = -1.0 if lower_is_better else 1.0
     rows = []
@@ -52,32 +53,34 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
         row |= {"last_step": steps[-1], "final": estimate[-1], "final_lower": lower[-1], "final_upper": upper[-1]}
         row |= dict(zip(("mean", "mean_lower", "mean_upper"), map(float, variant.mean), strict=True))
         row |= {"best_step": steps[best], "best": estimate[best]}
-        row |= dict.fromkeys((*REACHES, *APART, *IMPROVES), "")
+        row |= dict.fromkeys((*REACHES, *DIFFERS, *IMPROVES), "")
         if unguided is not None and variant is not unguided:
-            shared = unguided.curve.estimate[unguided.curve.steps <= max(unguided.curve.steps[0], steps[-1])]
-            row |= _steps_to(variant, sign, sign * shared[-1])
+            row |= _steps_to(variant, sign, sign * level_of(unguided, float(steps[-1])))
             row |= _against(variant, unguided, sign)
         rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
     return rows
 
 
+def level_of(unguided: Variant, last: float) -> float:
+    """Return the value at `RISE` of the unguided agents' way from their first evaluation to the last step."""
+    values = unguided.curve.estimate[unguided.curve.steps <= max(unguided.curve.steps[0], last)]
+    return float(values[0] + RISE * (values[-1] - values[0]))
+
+
 def _against(variant: Variant, unguided: Variant, sign: float) -> Row:
     """Return the columns that compare a variant with the unguided one, without intervals for a single seed."""
     pair = variant, unguided
-    better = statistics.improvement(*(sign * each.samples(each.area, lambda values, axis: values) for each in pair))
-    if min(len(each.seeds) for each in pair) == 1:
-        return {IMPROVES[0]: better[0]}
-    row: Row = dict(zip(IMPROVES, (better[0], *np.quantile(better[1:], [0.025, 0.975])), strict=True))
-    steps, *places = np.intersect1d(variant.curve.steps, unguided.curve.steps, return_indices=True)
-    own, its = (each.samples()[1:, at] for each, at in zip(pair, places, strict=True))
-    lower, upper = np.quantile(own - its, [0.025, 0.975], axis=0)
-    for column, apart in zip(APART, (lower > 0, upper < 0), strict=True):
-        row[column] = "; ".join(f"{start}-{end}" for start, end in statistics.stretches(steps, apart))
+    areas = [each.samples(each.area, lambda values, axis: values) for each in pair]
+    less = np.subtract(*(statistics.interquartile_mean(each, axis=1) for each in areas))
+    row: Row = {}
+    for names, of in ((DIFFERS, less), (IMPROVES, statistics.improvement(*(sign * each for each in areas)))):
+        ends = np.quantile(of[1:], [0.025, 0.975]) if min(len(each.seeds) for each in pair) > 1 else ()
+        row |= dict(zip(names, (of[0], *ends), strict=False))
     return row
 
 
 def _steps_to(variant: Variant, sign: float, level: float) -> Row:
-    """Return the columns of the step from which a variant's seeds stay at a level; an interval for several seeds."""
+    """Return the columns of the step at which a variant's seeds reach a level; an interval for several seeds."""
     own, *draws = variant.samples(lambda curves: statistics.steps_to_level(variant.curve.steps, sign * curves, level))
     numbers = (own[1], *(statistics.censored_interval(np.array(draws)) if len(variant.seeds) > 1 else ()))
     return dict(zip(REACHES, (round(float(step)) if np.isfinite(step) else "never" for step in numbers), strict=False))
@@ -115,7 +118,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> list[str]:
     """Return the lines of a Markdown table; cells are Markdown already."""
-    head, *body = (f"| {' | '.join(map(str, row))} |" for row in (header, *rows))
+    head, *body = (f"| {' | '.join(map(format, row))} |" for row in (header, *rows))
     return [head, "|" + "---|" * len(header), *body]
 
 
@@ -123,8 +126,7 @@ def summary_lines(rows: Sequence[Row]) -> list[str]:
     """Return the summary as a table in Markdown."""
     header = [name for name in ("task", "run") if name in rows[0]]
     header += ["guidance", "labels", "seeds", "episodes", "last step", "final", "mean over the curve", "best (at step)"]
-    header += ["stays at the unguided final from step", "above the unguided", "below the unguided"]
-    header += ["probability of improvement"]
+    header += [f"{RISE:.0%} of the unguided way at step", "mean less the unguided's", "probability of improvement"]
     return markdown_table(header, [_summary_cells(row) for row in rows])
 
 
@@ -138,11 +140,9 @@ def _summary_cells(row: Row) -> list[object]:
     seeds = f"{row['seeds']} of {int(row['seeds']) + failed}, {failed} failed" if failed else row["seeds"]
     cells: list[object] = [markdown(row[name]) for name in ("task", "run", "guidance") if name in row]
     cells += [f"{row['labels']:,}", seeds, _step(row["episodes"]), f"{row['last_step']:,}"]
-    cells += [str(Interval(*(row[key + end] for end in ("", "_lower", "_upper")))) for key in ("final", "mean")]  # pyright: ignore[reportArgumentType]
+    cells += [Interval(*(row[key + end] for end in ("", "_lower", "_upper"))) for key in ("final", "mean")]  # pyright: ignore[reportArgumentType]
     cells += [f"{row['best']:.3f} ({row['best_step']:,})", f"{reached} [{', '.join(ends)}]" if any(ends) else reached]
-    for column in APART:
-        apart = [stretch.split("-") for stretch in str(row[column]).split("; ") if stretch]
-        spans = [f"{int(start):,} to {int(end):,}" if start != end else f"{int(start):,}" for start, end in apart]
-        cells.append("; ".join(spans))
-    better: list[Any] = [np.nan if row[name] == "" else row[name] for name in IMPROVES]
-    return [*cells, "" if np.isnan(better[0]) else str(Interval(*better))]
+    for names, sign in ((DIFFERS, "+"), (IMPROVES, "")):
+        of: list[Any] = [np.nan if row[name] == "" else row[name] for name in names]
+        cells.append("" if np.isnan(of[0]) else format(Interval(*of), sign))
+    return cells

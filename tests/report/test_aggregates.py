@@ -29,8 +29,7 @@ def write(folder, task, guidance, values, labels=0, constants=None):
 
 
 def table(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(path.read_text().splitlines()))
 
 
 @pytest.fixture

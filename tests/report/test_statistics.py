@@ -24,7 +24,7 @@ def test_interquartile_mean_by_hand(values, expected):
 
 def test_intervals_of_normal_data_cover_the_truth_as_often_as_the_docstring_says():
     rng = np.random.default_rng(0)
-    for seeds, expected in ((5, 0.90), (20, 0.945)):
+    for seeds, expected in ((2, 0.5), (3, 0.75), (5, 0.90), (20, 0.945)):
         found = statistics.interval(rng.normal(size=(seeds, 1500)), resamples=1000)
         assert np.mean((found.lower <= 0) & (found.upper >= 0)) == pytest.approx(expected, abs=0.03)
 
@@ -36,9 +36,7 @@ def test_equal_seeds_have_no_width_and_a_single_seed_no_interval():
     assert np.isnan(single[1:]).all()
 
 
-def test_stretches_are_unbroken_and_the_probability_of_improvement_counts_pairs():
-    steps = np.array([0, 10, 20, 30, 40])
-    assert statistics.stretches(steps, np.array([False, True, True, False, True])) == [(10, 20), (40, 40)]
+def test_the_probability_of_improvement_counts_pairs():
     values, others = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), np.array([[2.0, 0.0], [0.0, 1.0]])
     np.testing.assert_allclose(statistics.improvement(values, others), [4.5 / 6, 1.5 / 6])
 
@@ -50,12 +48,24 @@ def test_the_mean_over_uneven_steps_by_hand():
     np.testing.assert_allclose(statistics.mean_over_curve(steps, values, (5, 20)), [(0.75 * 5 + 10) / 15, 2.0])
 
 
-def test_a_level_is_reached_where_a_curve_stays_above_it():
+def test_a_level_is_reached_where_the_nondecreasing_fit_reaches_it():
     values = np.array([[0.0, 0.5, 0.4, 0.6], [0.9, 0.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4], [0.5, 0.9, 0.6, 0.5]])
     found = statistics.steps_to_level(np.array([0, 10, 20, 30]), values, 0.5)
-    np.testing.assert_allclose(found, [[25.0, 25.0], [30.0, np.inf], [30.0, np.inf], [0.0, 0.0]])
+    np.testing.assert_allclose(statistics.nondecreasing(values)[:2], [[0.0, 0.45, 0.45, 0.6], [0.225] * 4])
+    np.testing.assert_allclose(found, [[20 + 10 / 3] * 2, [30.0, np.inf], [30.0, np.inf], [0.0, 0.0]])
     assert statistics.censored_interval(np.array([[1.0, 1.0], *[[2.0, 2.0]] * 98, [3.0, np.inf]])) == (2.0, 2.0)
     assert statistics.censored_interval(np.array([[3.0, np.inf]] * 9)) == (3.0, np.inf)
+
+
+def test_intervals_of_the_steps_to_a_level_near_the_plateau_cover_the_truth():
+    """Eight seeds of their own pace, on 100 episodes each: success rises to 0.95, the level is 0.93."""
+    rng, steps, covered = np.random.default_rng(0), np.arange(31), []
+    for middle in 8 + 2 * rng.normal(size=(60, 8, 1)):  # of the rise
+        each = rng.binomial(5, 0.95 / (1 + np.exp((middle - steps) / 1.2))[:, None], (8, 20, 31)) / 5
+        draws = statistics.resampled(each, 200, of=lambda curves: statistics.steps_to_level(steps, curves, 0.93))
+        lower, upper = statistics.censored_interval(draws)
+        covered.append(lower <= 8 + 1.2 * np.log(0.93 / 0.02) <= upper)
+    assert sum(covered) >= 54  # of 60; of the steps from which curves stay at the level none does
 
 
 def test_an_interval_covers_the_truth_only_if_it_draws_the_shared_episodes_too():
@@ -71,7 +81,7 @@ def test_an_interval_covers_the_truth_only_if_it_draws_the_shared_episodes_too()
 
 
 def test_no_interval_is_printed_with_a_width_of_zero():
-    shown = [str(Interval(*map(np.array, ends))) for ends in ((0.97, 0.96996, 0.97004), (0.97,) * 3)]
+    shown = [f"{Interval(*map(np.array, ends))}" for ends in ((0.97, 0.96996, 0.97004), (0.97,) * 3)]
     assert shown == ["0.97000 [0.96996, 0.97004]", "0.970 [no spread]"]
 
 

@@ -1,5 +1,7 @@
-"""The results of several runs as one table: what is found where, and what is refused in one line."""
+"""The results of several runs as one table: what is found where, says of its origin, and is refused in one line."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +11,10 @@ import pytest
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.storage import results
+from cuelearner_jax.storage.provenance import provenance
 from cuelearner_jax.storage.table import TableWriter, finish
 
+ROOT = Path(__file__).parents[2]
 CONSTANTS = {"run": "a", "task": "one_ball", "guidance": "relative", "config_hash": "0f", "hardware": "1 x cpu"}
 SEEDS, LABELS = np.array([3, 4]), np.array([100, 500])
 
@@ -53,7 +57,7 @@ def test_every_column_has_its_meaning_in_the_file_and_on_the_page(tmp_path):
         meanings = {field.name: field.metadata[b"description"].decode() for field in file.schema_arrow}
     assert meanings["seed"] == results.MEANINGS["seed"]
     assert meanings["reward"] == results.MEANINGS["*"]
-    page = (Path(__file__).parents[2] / "docs/reference/columns.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/reference/columns.md").read_text(encoding="utf-8")
     rows = (line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| `"))
     assert {name.strip("`"): meaning for name, meaning in rows} == results.MEANINGS
 
@@ -73,3 +77,21 @@ def test_errors_are_one_clear_line(tmp_path):
     write(tmp_path / "a")
     write(tmp_path / "b", task="easy")
     assert set(results.read(tmp_path)["task"].to_pylist()) == {"easy", "one_ball"}  # no error: the rows tell them apart
+
+
+def test_the_command_can_be_given_again(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/some/where/cuelearner", "sweep", "a task", "--seeds", "2"])
+    columns = provenance()
+    assert columns["command"] == "cuelearner sweep 'a task' --seeds 2"
+    assert columns["versions"].startswith(f"python {sys.version.split()[0]}, ")
+    assert "jax 0." in columns["versions"]
+    assert columns["hardware"]
+
+
+def test_the_commit_is_that_of_the_checkout_or_empty():
+    commit = provenance()["commit"].removesuffix("-dirty")
+    if not (ROOT / ".git").exists():
+        assert commit == ""
+        return
+    head = subprocess.run(["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout
+    assert commit == head[:12]

@@ -5,6 +5,8 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from jaxtyping import TypeCheckError
 from rooms import world
 
 from cuelearner_envs.navigation.geometry import clearance, in_frame, line_clearance
@@ -24,6 +26,10 @@ def test_a_point_in_the_frame_of_a_box_by_hand():
     # From (1, 2) the point (3, 2) is 2 m along x; in a frame turned by 90 degrees that is 2 m along -y.
     expected = [[2.0, 0.0], [0.0, -2.0], [3 * root + 1.0, 2 * root - 1.5], [0.0, 0.0]]
     np.testing.assert_allclose(in_frame(boxes, jnp.array([3.0, 2.0])), expected, atol=1e-6)
+    with pytest.raises(TypeCheckError, match="boxes"):  # the checker of shapes is in force
+        in_frame(boxes[:, :4], jnp.zeros(2))
+    with pytest.raises(TypeCheckError):
+        jax.eval_shape(in_frame, boxes, jnp.zeros(3))
 
 
 def test_clearance_by_hand():
