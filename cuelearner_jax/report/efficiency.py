@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import statistics
-from cuelearner_jax.report.tables import RISE, Row, identity, level_of, markdown, markdown_table, unguided_of
+from cuelearner_jax.report.tables import GAIN, Row, identity, level_of, markdown, markdown_table, unguided_of
 from cuelearner_jax.report.variants import Variant
 
 Samples = Float[np.ndarray, "samples"]  # the estimate, then the draws of its bootstrap
@@ -30,8 +30,8 @@ class Question:
     """Value of the metric to be reached (default: see --level-at). Of several tasks: the value whose normalised score
     is 1 (default: the best variant's mean over the curve)."""
     level_at: int | None = None
-    """Without --level: step of the unguided agents whose value is the level (default: 90% of the way from their first
-    value to the last of all curves)."""
+    """Without --level: step of the unguided agents whose value is the level (default: 90% of their gain from the first
+    to the last step of all curves)."""
     reference: str | None = None
     """Kind of guidance with whose labels those of others are compared (default: each)."""
 
@@ -134,7 +134,7 @@ def _level(variants: Sequence[Variant], question: Question) -> tuple[float, str]
     if (unguided := next((variant for variant in variants if variant.guidance == "none"), None)) is None:
         raise UserError("no results of unguided agents, whose level would be the one to reach: give --level")
     if (at := question.level_at) is None:
-        return level_of(unguided, unguided.span[1]), f"{RISE:.0%} of the way of {unguided.name} over the curve"
+        return level_of(unguided, unguided.span[1]), f"{GAIN:.0%} of the gain of {unguided.name} over the curve"
     if at not in (steps := unguided.curve.steps):
         raise UserError(f"--level-at {at}: {unguided.name} has no such step, but {', '.join(map(str, steps))}")
     return float(unguided.curve.estimate[np.flatnonzero(steps == at)[0]]), f"that of {unguided.name} at step {at:,}"

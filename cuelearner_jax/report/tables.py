@@ -18,7 +18,7 @@ from cuelearner_jax.report.statistics import Interval
 from cuelearner_jax.report.variants import Variant
 
 Row = dict[str, str | int | float]  # of a table
-RISE = 0.9  # of the way from the unguided agents' first value to their last: the level to reach where none is given
+GAIN = 0.9  # share of the unguided agents' gain over the curve: the level to reach where none is given
 COMPARISONS = ("reaches_unguided", "mean_difference", "improvement")
 REACHES, DIFFERS, IMPROVES = (tuple(name + end for end in ("", "_lower", "_upper")) for name in COMPARISONS)
 
@@ -62,9 +62,9 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
 
 
 def level_of(unguided: Variant, last: float) -> float:
-    """Return the value at `RISE` of the unguided agents' way from their first evaluation to the last step."""
+    """Return the value at `GAIN` of what the unguided agents gain from their first evaluation to the last step."""
     values = unguided.curve.estimate[unguided.curve.steps <= max(unguided.curve.steps[0], last)]
-    return float(values[0] + RISE * (values[-1] - values[0]))
+    return float(values[0] + GAIN * (values[-1] - values[0]))
 
 
 def _against(variant: Variant, unguided: Variant, sign: float) -> Row:
@@ -126,7 +126,7 @@ def summary_lines(rows: Sequence[Row]) -> list[str]:
     """Return the summary as a table in Markdown."""
     header = [name for name in ("task", "run") if name in rows[0]]
     header += ["guidance", "labels", "seeds", "episodes", "last step", "final", "mean over the curve", "best (at step)"]
-    header += [f"{RISE:.0%} of the unguided way at step", "mean less the unguided's", "probability of improvement"]
+    header += [f"{GAIN:.0%} of the unguided gain at step", "mean less the unguided's", "probability of improvement"]
     return markdown_table(header, [_summary_cells(row) for row in rows])
 
 

@@ -69,7 +69,7 @@ def test_the_level_is_the_unguided_agents_at_a_step():
     variants = [same("none", 0, 0.8), same("relative", 100, 1.6)]
     assert efficiency_of(variants, Question(level_at=50)).level == pytest.approx(0.4)
     found = efficiency_of(variants, Question())
-    assert (found.level, found.origin) == (pytest.approx(0.72), "90% of the way of no guidance over the curve")
+    assert (found.level, found.origin) == (pytest.approx(0.72), "90% of the gain of no guidance over the curve")
     with pytest.raises(UserError, match="--level-at 55: no guidance has no such step, but 0, 10, 20"):
         efficiency_of(variants, Question(level_at=55))
     with pytest.raises(UserError, match="no results of unguided agents"):
