@@ -93,7 +93,7 @@ def test_agreement_counts_what_was_said_alone():
     said[:, 1:] = cl.UNSAID
     of = cl.Labels(obs, actions, said)
     all_four = cl.agreement(wanted, of, eps=EPS, space=SPACE).policy
-    np.testing.assert_allclose(all_four, [1.0, 0.638, 1.0], atol=1e-3)  # the 5% quantile of Beta(4.5, 0.5)
+    np.testing.assert_allclose(all_four, [1.0, 4 / (4 + 1.96**2), 1.0], atol=1e-4)  # by Wilson's score
     assert cl.agreement(off, of, eps=EPS, space=SPACE).policy[0] == 0.0  # it calls each of its own actions right
     swapped = of._replace(answer=np.where(said == cl.UNSAID, said, -said))
     assert cl.agreement(wanted, swapped, eps=EPS, space=SPACE).policy[0] == 0.0
