@@ -179,10 +179,10 @@ def _measurements(rows: list[Measured], title: str, episodes: str) -> Table:
 
 def _comparison(difference: Difference, other: str, title: str, episodes: str) -> Table:
     both = difference.row, difference.other
-    over = f"{episodes}, paired" if difference.over == "episodes" else f"seeds and {episodes} (interquartile means)"
+    over = {"episodes": f"{episodes}, paired, Student's t", "seeds": f"seeds and {episodes} (interquartile means)"}
     names = zip((title, other), map(measurements.variant, both), strict=True)
     heading = " against ".join(f"{name} ({variant})" if variant and name != "base" else name for name, variant in names)
-    caption = f"mean [95% interval]; of the difference over {over}"
+    caption = f"mean [95% interval]; of the difference over {over[difference.over]}"
     table = Table("metric", "policy", "against", "difference", title=heading, caption=caption)
     for name, less in difference.metrics.items():
         table.add_row(name, *(f"{measurements.spread(row, name)}" for row in both), f"{less:+}")
@@ -190,10 +190,10 @@ def _comparison(difference: Difference, other: str, title: str, episodes: str) -
 
 
 def _verdict(difference: Difference) -> str:
-    names = {"excludes": [], "includes": []}
+    names = {"excludes 0": [], "includes 0": [], "needs more episodes": []}
     for name, less in difference.metrics.items():
         few = less.lower == less.upper != 0 and difference.row.each[name].size < FEWEST  # all alike: a sign test
-        if not (few or np.isnan(less.lower)):
-            names["excludes" if less.excludes_zero else "includes"].append(name)
-    parts = [f"{verb} 0 for {', '.join(metrics)}" for verb, metrics in names.items() if metrics]
-    return f"The 95% interval of the difference {'; '.join(parts) or 'needs more episodes'}."
+        says = "excludes 0" if less.excludes_zero else "includes 0"
+        names["needs more episodes" if few or np.isnan(less.lower) else says].append(name)
+    parts = [f"{says} for {', '.join(metrics)}" for says, metrics in names.items() if metrics]
+    return f"The 95% interval of the difference {'; '.join(parts)}."

@@ -67,7 +67,7 @@ def with_teacher(
 def between(one: LabelFile, other: LabelFile) -> AnswerAgreement:
     """Return how well two files agree: each answer with each of the other file's to an equal observation and action."""
     form = form_of(one)
-    if form is None or (one.answers, one.space, one.eps) != (other.answers, other.space, other.eps):
+    if form is None or (one.answers, one.space.size, one.eps) != (other.answers, other.space.size, other.eps):
         kinds = [
             file.answers + ("" if file.eps is None else f" ({file.eps:g} {file.space.unit})") for file in (one, other)
         ]
@@ -99,7 +99,7 @@ def merge(files: Iterable[LabelFile], labels_hold: Iterable[str] = ()) -> tuple[
     for file in files:
         if len(np.unique(file.seeds)) > 1:
             raise UserError("a file holds the labels of several seeds: merge files of one seed each")
-        own, other = ({**of.task, "answers": of.answers, "space": of.space, "eps": of.eps} for of in (first, file))
+        own, other = ({**of.space.to_json(), **of.task, "answers": of.answers, "eps": of.eps} for of in (first, file))
         apart = {"path"} if "digest" in first.task else {}  # a recording, which its digest tells, may lie elsewhere
         for name in own | other:
             if name not in {*apart, *labels_hold} and (before := own.get(name)) != (now := other.get(name)):

@@ -30,8 +30,8 @@ class Question:
     """Value of the metric to be reached (default: see --level-at). Of several tasks: the value whose normalised score
     is 1 (default: the best variant's mean over the curve)."""
     level_at: int | None = None
-    """Without --level: step of the unguided agents whose value is the level (default: 90% of their gain from the first
-    to the last step of all curves)."""
+    """Without --level: step of the unguided agents whose value is the level (default: 90% of their gain over the
+    curve)."""
     reference: str | None = None
     """Kind of guidance with whose labels those of others are compared (default: each)."""
 
@@ -118,7 +118,7 @@ def efficiency_of(variants: Sequence[Variant], question: Question, lower_is_bett
         if variant.guidance == "none" and sign * (level - variant.curve.estimate[0]) <= 0:
             raise UserError(
                 f"the level {level:.3g} is no better than what {variant.name} begins with "
-                f"({variant.curve.estimate[0]:.3g}): give another --level or a later --level-at"
+                f"({variant.curve.estimate[0]:.3g}): give --level or a later --level-at"
             )
         rows.append(_row(own, None if unguided is None or unguided is variant else every[id(unguided)]))
         if variant.labels:
@@ -134,7 +134,7 @@ def _level(variants: Sequence[Variant], question: Question) -> tuple[float, str]
     if (unguided := next((variant for variant in variants if variant.guidance == "none"), None)) is None:
         raise UserError("no results of unguided agents, whose level would be the one to reach: give --level")
     if (at := question.level_at) is None:
-        return level_of(unguided, unguided.span[1]), f"{GAIN:.0%} of the gain of {unguided.name} over the curve"
+        return level_of(unguided), f"{GAIN:.0%} of the gain of {unguided.name} over the curve"
     if at not in (steps := unguided.curve.steps):
         raise UserError(f"--level-at {at}: {unguided.name} has no such step, but {', '.join(map(str, steps))}")
     return float(unguided.curve.estimate[np.flatnonzero(steps == at)[0]]), f"that of {unguided.name} at step {at:,}"

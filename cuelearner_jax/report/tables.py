@@ -36,8 +36,8 @@ def code(text: object) -> str:
 def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[Row]:
     """Return one row for each variant, with unrounded numbers; the columns are those of `summary.csv`.
 
-    `reaches_unguided` is the interquartile mean over seeds of the step at which a seed is at `level_of` the unguided
-    agents by the variant's last step (`steps_to_level`); "never" if too many seeds end below that for a mean.
+    `reaches_unguided` is the interquartile mean over seeds of the step at which a seed reaches `level_of` the unguided
+    agents (`steps_to_level`); "never" if too many seeds end below that for a mean; empty where these gain nothing.
     `mean_difference` is the mean over the curve less the unguided seeds'. `improvement` is the probability that a
     seed's mean over the curve is better than that of an unguided seed. Equal seeds are drawn together. With several
     runs, a variant is compared with the unguided variant of `unguided_of`.
@@ -54,17 +54,18 @@ def summary(variants: Sequence[Variant], lower_is_better: bool = False) -> list[
         row |= dict(zip(("mean", "mean_lower", "mean_upper"), map(float, variant.mean), strict=True))
         row |= {"best_step": steps[best], "best": estimate[best]}
         row |= dict.fromkeys((*REACHES, *DIFFERS, *IMPROVES), "")
+        if unguided is not None and sign * (level_of(unguided) - unguided.curve.estimate[0]) > 0:
+            row |= _steps_to(variant, sign, sign * level_of(unguided))
         if unguided is not None and variant is not unguided:
-            row |= _steps_to(variant, sign, sign * level_of(unguided, float(steps[-1])))
             row |= _against(variant, unguided, sign)
         rows.append({name: value.item() if isinstance(value, np.generic) else value for name, value in row.items()})
     return rows
 
 
-def level_of(unguided: Variant, last: float) -> float:
-    """Return the value at `GAIN` of what the unguided agents gain from their first evaluation to the last step."""
-    values = unguided.curve.estimate[unguided.curve.steps <= max(unguided.curve.steps[0], last)]
-    return float(values[0] + GAIN * (values[-1] - values[0]))
+def level_of(unguided: Variant) -> float:
+    """Return the value at `GAIN` of what the unguided agents gain from their first evaluation to their last."""
+    first, last = unguided.curve.estimate[[0, -1]].tolist()
+    return first + GAIN * (last - first)
 
 
 def _against(variant: Variant, unguided: Variant, sign: float) -> Row:

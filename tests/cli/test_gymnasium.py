@@ -101,8 +101,8 @@ def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
     source = source_of(look_ahead(again[1:]))
     assert (source.config.task.slices, source.config.task.processes) == (("hand", "goal"), 1)  # the folder's own
     assert main([*again, "--episodes", "4"]) == 0
-    for steps in (5, 12):  # labels about this world, with words for its cues
-        there, rows = cl.make(world[1], max_steps=steps, cues=("a,b", "c,d", "e,f")), np.zeros((1, steps, 6), "f4")
+    for steps, words in ((5, "a,b"), (12, "left,right")):  # labels about this world, with words for its cues
+        there, rows = cl.make(world[1], max_steps=steps, cues=(words, "c,d", "e,f")), np.zeros((1, steps, 6), "f4")
         labels = probes.label_set(rows, rows[..., :3], rows[..., :3], np.ones((1, steps), bool))
         about = {"name": "gymnasium", **to_json(there.config)}, "relative", there.actions, 1 / 36, np.zeros(1)
         label_files.write(tmp_path / f"{steps}.parquet", *about, labels)
