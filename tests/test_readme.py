@@ -1,7 +1,6 @@
 """The README is short, its numbers are what docs/data hold, and each kind of feedback has a page."""
 
 import csv
-import json
 import re
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 
 from cuelearner_jax.arbiters import ARBITERS
 from cuelearner_jax.guides import registry
+from cuelearner_jax.report.document import ReportRequest, contents_of
 from cuelearner_jax.report.statistics import interquartile_mean
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -68,11 +68,13 @@ def test_success_in_rooms():
 
 
 def test_steps_of_an_arm_that_learns_to_pick():
-    steps = json.loads((DATA / "arms/training_pick.json").read_text())["steps"]
-    means = {(row["run"], row["guidance"], row["labels"]): f"{round(row['middle'][0], -3):,.0f}" for row in steps}
-    labelled, without = row("steps to 80% success of an arm")[1:3]
-    assert labelled == f"500 labels: {means['stored', 'relative', 500]}"
-    assert without == means["alone", "none", 0]
+    request = ReportRequest(metric="success", by_run=True, level=0.8)
+    rows = contents_of(sorted((DATA / "arms/pick").iterdir()), request).efficiency.tables["efficiency"]
+    page = (PAGES.parent / "results/arms.md").read_text(encoding="utf-8")
+    assert all(f"| {one['steps_to_level']:,.0f} [{one['steps_to_level_lower']:,.0f}, " in page for one in rows)
+    steps = {(one["run"], one["labels"], one["guidance"]): f"{round(one['steps_to_level'], -3):,.0f}" for one in rows}
+    both = [f"500 labels: {steps['stored', 500, 'relative']}", steps["alone", 0, "none"]]
+    assert row("steps to 80% success of an arm")[1:3] == both
 
 
 def test_success_of_robots_drawn_by_chance():

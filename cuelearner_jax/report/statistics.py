@@ -69,7 +69,7 @@ def interval(
 
     Equal data gives equal intervals. The bounds are NaN for a single seed. With few seeds the interval is too narrow:
     on normal data it covered the truth in 50% of 4,000 trials with 2 seeds, in 75% with 3, in 90% with 5, and in 94%
-    with 10 or more. Where seeds hardly differ it is up to twice too wide, as both draws hold an episode's luck.
+    with 10 or more. Where seeds hardly differ it is too wide, as both draws hold an episode's luck.
     """
     data = np.asarray(values, dtype=float)
     estimate = interquartile_mean(data)
@@ -126,10 +126,10 @@ def nondecreasing(curves: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, 
 
 
 def steps_to_level(steps: np.ndarray, curves: np.ndarray, level: float) -> Float[np.ndarray, "*samples 2"]:
-    """Return bounds of the `step_at_level` of each curve's `nondecreasing` fit: from there its average stays there.
+    """Return bounds of the step at which each curve's `nondecreasing` fit reaches the level: its average stays there.
 
-    They are equal where it is known: a fit that ends below needs more than all steps. A curve itself stays at a level
-    from its last dip on, which noise makes: near a plateau that is too late, and intervals seldom hold the truth.
+    The bounds are equal where the step is known; a fit that ends below needs more than all steps. The curve itself
+    stays at a level from its last dip on, which noise makes near a plateau: too late, with intervals that miss.
     """
     crossing = step_at_level(steps, nondecreasing(curves), level)
     return np.stack([np.minimum(crossing, float(steps[-1])), crossing], axis=-1)

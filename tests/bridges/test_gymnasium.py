@@ -320,8 +320,8 @@ def test_an_instance_cannot_be_given_in_place_of_a_class():
 
 def test_episodes_that_all_begin_alike_are_told_once(capsys):
     cl.from_gymnasium(World, num_envs=1, processes=1)
-    told = capsys.readouterr().err
-    assert told.count("all episodes begin alike, whatever their seed") == told.count("World names no limit") == 1
+    lines = capsys.readouterr().err
+    assert lines.count("all episodes begin alike, whatever their seed") == lines.count("World names no limit") == 1
     cl.from_gymnasium("Pendulum-v1", num_envs=1, processes=1)
     cl.from_gymnasium(Adder, num_envs=1, processes=1)  # which truncates its episodes itself
     assert capsys.readouterr().err == ""

@@ -108,8 +108,8 @@ def test_code_is_adapted_by_code_that_teaches(tmp_path, capsys):
         label_files.write(tmp_path / f"{steps}.parquet", *about, labels)
     files = [str(tmp_path / f"{name}.parquet") for name in (5, 12, "both")]
     assert main(["labels", "merge", *files[:2], "--out", files[2]]) == 0
-    given = ["--guidance", "relative", "--judge-by", "labels", "--labels-from", files[2], *SMALL]
-    assert main([*command[:4], *given, "--out", str(tmp_path / "given")]) == 0
+    options = ["--guidance", "relative", "--judge-by", "labels", "--labels-from", files[2], *SMALL]
+    assert main([*command[:4], *options, "--out", str(tmp_path / "given")]) == 0
 
 
 @pytest.mark.parametrize(

@@ -29,9 +29,9 @@ def test_an_interval_of_a_mean_covers_it_in_95_of_100_also_of_few_values():
         assert np.mean((lower <= 0) & (upper >= 0)) == pytest.approx(0.95, abs=0.01)
     assert np.isnan(mean_interval(np.array([0.5]))[1:]).all()
     for successes in (0, 3, 20):
-        known = scipy.stats.binomtest(successes, 20).proportion_ci(method="wilson")
-        found = mean_interval(np.repeat([1.0, 0.0], [successes, 20 - successes]), is_share=True)
-        assert found == pytest.approx((successes / 20, *known))
+        ends = scipy.stats.binomtest(successes, 20).proportion_ci(method="wilson")
+        share = mean_interval(np.repeat([1.0, 0.0], [successes, 20 - successes]), is_share=True)
+        assert share == pytest.approx((successes / 20, *ends))
 
 
 def test_one_policy_has_an_interval_over_episodes_and_several_over_seeds():

@@ -307,10 +307,10 @@ class Instances:
             one.step(action)
         self.replays += len(request.history)
         if request.place and one.place != request.place:
-            shows = ", so pictures would show other situations" * (request.action is None)
+            pictures = ", so pictures would show other situations" if request.action is None else ""
             raise UserError(
                 f"{one.whose} does not repeat itself: with seed {request.seed} and the same {len(request.history)} "
-                f"actions it came elsewhere than before{shows}: let it draw from its own np_random alone, and reset "
+                f"actions it came elsewhere than before{pictures}: let it draw from its own np_random alone, and reset "
                 "everything in reset(seed=...), or use recorded situations (logs:FOLDER)"
             )
 
