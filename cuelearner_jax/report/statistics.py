@@ -84,8 +84,8 @@ def improvement(
 ) -> Float[np.ndarray, "draws"]:
     """Return each draw's probability of improvement (arXiv 2108.13264): the share of pairs won, a tie by half."""
     pairs = zip(values, np.sort(others, axis=1), strict=True)
-    places = [[np.searchsorted(its, mine, side).mean() for side in ("left", "right")] for mine, its in pairs]
-    return np.mean(places, axis=1) / others.shape[1]
+    places = [[np.searchsorted(its, mine, side) for side in ("left", "right")] for mine, its in pairs]
+    return np.mean(places, axis=(1, 2)) / others.shape[1]
 
 
 def mean_over_curve(
@@ -100,38 +100,38 @@ def mean_over_curve(
     return (np.asarray(values, dtype=float) * weights).sum(axis=-1) / weights.sum()
 
 
-def step_at_level(
-    steps: Float[np.ndarray, "steps"] | Int[np.ndarray, "steps"],
-    curves: Float[np.ndarray, "*samples steps"],
-    level: Float[np.ndarray, "*samples"] | float,
-) -> Float[np.ndarray, "*samples"]:
-    """Return the step from which each curve stays at its level or above; infinity if it ends below.
-
-    Between two evaluations the curve is a straight line. A curve that is never below gives the first step.
-    """
-    steps, level = np.asarray(steps, float), np.broadcast_to(np.asarray(level, float), curves.shape[:-1])
-    below = curves < level[..., None]
-    before = len(steps) - 1 - below[..., ::-1].argmax(axis=-1)  # the last evaluation below
-    after = np.minimum(before + 1, len(steps) - 1)
-    low, high = (np.take_along_axis(curves, at[..., None], axis=-1)[..., 0] for at in (before, after))
-    share = np.divide(level - low, high - low, out=np.zeros(level.shape), where=high > low)
-    crossed = np.where(below[..., -1], np.inf, steps[before] + share * (steps[after] - steps[before]))
-    return np.where(below.any(axis=-1), crossed, steps[0])
-
-
 def nondecreasing(curves: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, "*samples n"]:
     """Return the nondecreasing least-squares fit of each curve (isotonic regression, pool adjacent violators)."""
     fits = [scipy.optimize.isotonic_regression(curve).x for curve in curves.reshape(-1, curves.shape[-1])]
     return np.reshape(fits, curves.shape)
 
 
-def steps_to_level(steps: np.ndarray, curves: np.ndarray, level: float) -> Float[np.ndarray, "*samples 2"]:
-    """Return bounds of the step at which each curve's `nondecreasing` fit reaches the level: its average stays there.
+def step_at_level(steps: np.ndarray, curves: np.ndarray, level: ArrayLike) -> Float[np.ndarray, "*samples"]:
+    """Return the step at which each curve's `nondecreasing` fit reaches its level; infinity if the fit ends below.
 
-    The bounds are equal where the step is known; a fit that ends below needs more than all steps. The curve itself
-    stays at a level from its last dip on, which noise makes near a plateau: too late, with intervals that miss.
+    From there the curve's average stays at the level. `curves`: (*samples, steps). Between two evaluations the fit is a
+    straight line. A fit that is never below gives the first step. The curve itself stays at a level from its last dip
+    on, which noise makes near a plateau: too late, with intervals that miss. The fit is the slope of the sum's greatest
+    convex minorant, so its values below the level are those before the sum is least (first, up to rounding).
     """
-    crossing = step_at_level(steps, nondecreasing(curves), level)
+    steps, last = np.asarray(steps, float), curves.shape[-1] - 1
+    above = curves - np.broadcast_to(np.asarray(level, float), curves.shape[:-1])[..., None]
+    total = np.cumsum(np.concatenate([np.zeros_like(above[..., :1]), above], axis=-1), axis=-1)
+    rounding = 1e-12 * np.abs(above).sum(axis=-1, keepdims=True)
+    least = (total <= total.min(axis=-1, keepdims=True) + rounding).argmax(axis=-1)[..., None]
+    ahead = np.arange(last + 2) - least
+    slopes = (total - np.take_along_axis(total, least, -1)) / np.where(ahead, ahead, 1)
+    low, high = np.where(ahead < 0, slopes, -np.inf).max(-1), np.where(ahead > 0, slopes, np.inf).min(-1)
+    after = least[..., 0]
+    before = np.maximum(after - 1, 0)
+    with np.errstate(invalid="ignore"):  # where all are above or all below
+        crossed = steps[before] - low / (high - low) * (steps[np.minimum(after, last)] - steps[before])
+    return np.select([after == 0, after > last], [steps[0], np.inf], crossed)
+
+
+def steps_to_level(steps: np.ndarray, curves: np.ndarray, level: float) -> Float[np.ndarray, "*samples 2"]:
+    """Return bounds of `step_at_level`, equal where it is known; a fit that ends below needs more than all steps."""
+    crossing = step_at_level(steps, curves, level)
     return np.stack([np.minimum(crossing, float(steps[-1])), crossing], axis=-1)
 
 
