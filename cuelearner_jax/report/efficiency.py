@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from cuelearner_jax.errors import UserError
 from cuelearner_jax.report import statistics
@@ -79,17 +79,15 @@ def ratio_bounds(above: Range, below: Range) -> Range:
     return Range(divided(above.lower, below.upper, 0.0), divided(above.upper, below.lower, np.inf))
 
 
-def labels_for(
-    budgets: Int[np.ndarray, "budgets"], areas: Float[np.ndarray, "samples budgets"], target: Samples
-) -> Range:
+def labels_for(budgets: np.ndarray, areas: Float[np.ndarray, "samples budgets"], target: Samples) -> Range:
     """Return the labels at which areas under the curve, nondecreasing in the budget, first reach the target.
 
     Areas lie on straight lines over the logarithm of the labels between two budgets. Beyond the budgets only a bound is
     known: more than the largest budget, or no more than the smallest.
     """
-    first = areas[:, 0] >= target
-    exact = np.where(first, float(budgets[0]), np.exp(statistics.step_at_level(np.log(budgets), areas, target)))
-    return Range(np.where(first, 0.0, np.minimum(exact, float(budgets[-1]))), exact)
+    at = statistics.step_at_level(np.log(budgets), areas, target)
+    first, exact = at == np.log(budgets[0]), np.where(np.isinf(at), at, np.minimum(np.exp(at), float(budgets[-1])))
+    return Range(np.where(first, 0.0, np.minimum(exact, float(budgets[-1]))), np.where(first, float(budgets[0]), exact))
 
 
 def _columns(name: str, samples: Range, *own: Sampled) -> Row:

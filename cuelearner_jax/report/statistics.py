@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 RESAMPLES = 2000
+ROUNDING = 1e-6  # of recorded values, and of their means, as a share of the largest
 _EPISODES = 1 << 33  # the stream of episodes, beyond those of variants
 _BATCH_ELEMENTS = 4_000_000  # most numbers in memory at a time while resampling: 32 MB
 
@@ -79,11 +80,13 @@ def interval(
     return Interval(estimate, *np.quantile(means, [0.025, 0.975], axis=0))
 
 
-def improvement(
-    values: Float[np.ndarray, "draws seeds"], others: Float[np.ndarray, "draws others"]
-) -> Float[np.ndarray, "draws"]:
-    """Return each draw's probability of improvement (arXiv 2108.13264): the share of pairs won, a tie by half."""
-    pairs = zip(values, np.sort(others, axis=1), strict=True)
+def improvement(values: np.ndarray, others: np.ndarray) -> Float[np.ndarray, "draws"]:
+    """Return each draw's probability of improvement (arXiv 2108.13264): the share of pairs won, and half of the ties.
+
+    `values` and `others`: (draws, seeds). Those that are equal but for `ROUNDING` tie.
+    """
+    unit = ROUNDING * max(np.abs(values).max(), np.abs(others).max()) or 1.0
+    pairs = zip(np.rint(values / unit), np.sort(np.rint(others / unit), axis=1), strict=True)
     places = [[np.searchsorted(its, mine, side) for side in ("left", "right")] for mine, its in pairs]
     return np.mean(places, axis=(1, 2)) / others.shape[1]
 
@@ -109,23 +112,22 @@ def nondecreasing(curves: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, 
 def step_at_level(steps: np.ndarray, curves: np.ndarray, level: ArrayLike) -> Float[np.ndarray, "*samples"]:
     """Return the step at which each curve's `nondecreasing` fit reaches its level; infinity if the fit ends below.
 
-    From there the curve's average stays at the level. `curves`: (*samples, steps). Between two evaluations the fit is a
-    straight line. A fit that is never below gives the first step. The curve itself stays at a level from its last dip
-    on, which noise makes near a plateau: too late, with intervals that miss. The fit is the slope of the sum's greatest
-    convex minorant, so its values below the level are those before the sum is least (first, up to rounding).
+    From there the average of `curves`, (*samples, steps), stays there. Between evaluations the fit is a straight line.
+    The curve itself stays from its last dip on, which noise makes near a plateau: too late, with intervals that miss.
+    The fit is the slope of the sum's greatest convex minorant: its values below end where the sum is least (at first).
     """
     steps, last = np.asarray(steps, float), curves.shape[-1] - 1
     above = curves - np.broadcast_to(np.asarray(level, float), curves.shape[:-1])[..., None]
     total = np.cumsum(np.concatenate([np.zeros_like(above[..., :1]), above], axis=-1), axis=-1)
-    rounding = 1e-12 * np.abs(above).sum(axis=-1, keepdims=True)
+    rounding = ROUNDING * np.abs(curves).sum(axis=-1, keepdims=True)
     least = (total <= total.min(axis=-1, keepdims=True) + rounding).argmax(axis=-1)[..., None]
     ahead = np.arange(last + 2) - least
     slopes = (total - np.take_along_axis(total, least, -1)) / np.where(ahead, ahead, 1)
     low, high = np.where(ahead < 0, slopes, -np.inf).max(-1), np.where(ahead > 0, slopes, np.inf).min(-1)
     after = least[..., 0]
-    before = np.maximum(after - 1, 0)
+    start, end = steps[np.maximum(after - 1, 0)], steps[np.minimum(after, last)]
     with np.errstate(invalid="ignore"):  # where all are above or all below
-        crossed = steps[before] - low / (high - low) * (steps[np.minimum(after, last)] - steps[before])
+        crossed = start - low / (np.maximum(high, 0.0) - low) * (end - start)
     return np.select([after == 0, after > last], [steps[0], np.inf], crossed)
 
 

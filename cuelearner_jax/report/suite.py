@@ -21,7 +21,7 @@ from cuelearner_jax.runs.failures import describe_failed, variant_name
 SCORE, LEVEL = "score", 0.8  # the level of label efficiency
 NOTE = (
     "Interquartile means over the runs of all tasks with the most labels that all tasks share, with 95% bootstrap "
-    "intervals over seeds and episodes. A run's score is its mean over the curve: 0 is the mean without labels, held "
+    "intervals over seeds and episodes. A run's score is its mean over the curve: 0 is that without labels, held "
     "fixed, so `aggregates.csv` tells what is better than none; 1 is success in all episodes (shots), or the return of "
     "the unchanged world. Rewarded steps are of training, or spent on judging corrections, a lane."
 )

@@ -37,7 +37,7 @@ def test_equal_seeds_have_no_width_and_a_single_seed_no_interval():
 
 
 def test_the_probability_of_improvement_counts_pairs():
-    values, others = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), np.array([[2.0, 0.0], [0.0, 1.0]])
+    values, others = np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]), np.array([[2.0, 0.0], [1e-9, 1.0]])
     np.testing.assert_allclose(statistics.improvement(values, others), [4.5 / 6, 1.5 / 6])
 
 
@@ -49,7 +49,7 @@ def test_the_mean_over_uneven_steps_by_hand():
 
 
 def test_a_level_is_reached_where_the_nondecreasing_fit_reaches_it():
-    values = np.array([[0.0, 0.5, 0.4, 0.6], [0.9, 0.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4], [0.7, 0.3, 0.7, 0.3]])
+    values = np.array([[0.0, 0.5, 0.4, 0.6], [0.9, 0, 0, 0], [0.1, 0.2, 0.3, 0.4], np.float32([0.9, 0.1, 0.9, 0.1])])
     found = statistics.steps_to_level(np.array([0, 10, 20, 30]), values, 0.5)
     np.testing.assert_allclose(statistics.nondecreasing(values)[:2], [[0.0, 0.45, 0.45, 0.6], [0.225] * 4])
     np.testing.assert_allclose(found, [[20 + 10 / 3] * 2, [30.0, np.inf], [30.0, np.inf], [0.0, 0.0]])
