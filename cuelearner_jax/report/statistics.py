@@ -112,9 +112,9 @@ def nondecreasing(curves: Float[np.ndarray, "*samples n"]) -> Float[np.ndarray, 
 def step_at_level(steps: np.ndarray, curves: np.ndarray, level: ArrayLike) -> Float[np.ndarray, "*samples"]:
     """Return the step at which each curve's `nondecreasing` fit reaches its level; infinity if the fit ends below.
 
-    From there the average of `curves`, (*samples, steps), stays there. Between evaluations the fit is a straight line.
-    The curve itself stays from its last dip on, which noise makes near a plateau: too late, with intervals that miss.
-    The fit is the slope of the sum's greatest convex minorant: its values below end where the sum is least (at first).
+    The average of `curves` (*samples, steps) from there on is the level (one, or *samples) or more. The fit is straight
+    between evaluations. A curve's own last dip, which noise makes near a plateau, is too late, and its intervals miss.
+    The fit is the slope of the sum's greatest convex minorant: below the level until the sum over it is first least.
     """
     steps, last = np.asarray(steps, float), curves.shape[-1] - 1
     above = curves - np.broadcast_to(np.asarray(level, float), curves.shape[:-1])[..., None]
